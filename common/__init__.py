@@ -1,0 +1,1 @@
+"""telepose: what sender and receiver share (geometry, body, wire formats, transport, runtime)."""

@@ -1,0 +1,1 @@
+"""telepose receiver: from the wire to the person on the screen."""

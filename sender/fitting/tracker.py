@@ -1,0 +1,32 @@
+"""The one interface of all pose trackers: a cloud in, a pose and how it went out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+from common.body.skeleton import Skeleton
+from common.body.skeleton_pose import SkeletonPose
+from common.geometry.point_cloud import PointCloud
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FitResult:
+    """One frame's fit. ``inliers``: share of the cloud's points near the fitted surface, 0..1. ``rms_m``: RMS
+    point-to-surface distance of the inliers [m]. ``confidence``: 0..1, the fit as a whole."""
+
+    skeleton: Skeleton
+    pose: SkeletonPose
+    converged: bool
+    iterations: int
+    inliers: float
+    rms_m: float
+    confidence: float
+
+
+class Tracker(Protocol):
+    """Follows one person. ``track`` returns None while no person has been found yet (``status`` says why)."""
+
+    @property
+    def status(self) -> str: ...
+    def track(self, cloud: PointCloud, capture_ns: int) -> FitResult | None: ...
