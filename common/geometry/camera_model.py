@@ -72,4 +72,4 @@ def project(camera: Camera, points: NDArray[np.floating]) -> tuple[NDArray[np.fl
     T_camera_world = inverse(camera.T_world_camera)
     p = np.asarray(points, np.float64) @ T_camera_world[:3, :3].T + T_camera_world[:3, 3]
     pixels, _ = cv2.projectPoints(p.reshape(-1, 1, 3), np.zeros(3), np.zeros(3), camera.matrix, camera.distortion)
-    return pixels.reshape(-1, 2), p[:, 2]
+    return np.asarray(pixels, np.float64).reshape(-1, 2), p[:, 2]

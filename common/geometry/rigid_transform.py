@@ -30,14 +30,14 @@ def transform_points(T_target_source: Array, points: Array) -> Array:
     return np.ascontiguousarray(points @ T[:3, :3].T + T[:3, 3])
 
 
-def look_at(eye: Array, target: Array, up: Array = np.array([0.0, 1.0, 0.0])) -> Array:
+def look_at(eye: Array, target: Array, up: Array | None = None) -> Array:
     """``T_world_camera`` (4, 4) of an OpenCV camera at ``eye`` (3,) looking at ``target`` (3,) [m, world].
 
     Raises:
-        ValueError: eye and target coincide, or the view direction is parallel to ``up``.
+        ValueError: eye and target coincide, or the view direction is parallel to ``up`` (default: world y).
     """
     forward = np.asarray(target, float) - np.asarray(eye, float)
-    right = np.cross(forward, up)
+    right = np.cross(forward, np.array([0.0, 1.0, 0.0]) if up is None else up)
     if np.linalg.norm(forward) < 1e-9 or np.linalg.norm(right) < 1e-9:
         raise ValueError("look_at: eye, target and up do not span a view")
     forward /= np.linalg.norm(forward)
