@@ -1,0 +1,116 @@
+"""DISPOSE's distortion score σ: how much a mesh must deform to take another skeleton's pose (§5.2, Eq. 1–2).
+
+Vertices move rigidly with their links, so only edges joining two links change length. For one pair of links the
+change depends on their relative pose alone: σ needs the skeleton, not the animated mesh.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from common.body.rigged_mesh import RiggedMesh
+from common.body.skeleton import LINK_INDEX, LINK_NAMES, SIDES
+
+START_THRESHOLD = 0.15  # DISPOSE §7.1; its edges are coarser than ours, so the session corrects it at once
+
+_LOW_WEIGHTS = {"hand": 0.5, "fingers": 0.25, "foot": 0.5, "toes": 0.25}
+
+
+def default_region_weights() -> NDArray[np.float32]:
+    """ω (L,) float32: 1, less for hands, fingers, feet and toes, which are prone to capture errors (§5.2)."""
+    weights = np.ones(len(LINK_NAMES), np.float32)
+    for part, weight in _LOW_WEIGHTS.items():
+        for side in SIDES:
+            weights[LINK_INDEX[f"{side}_{part}"]] = weight
+    return weights
+
+
+def distortion_score(
+    mesh: RiggedMesh, T_world_link: NDArray[np.float32], region_weights: NDArray[np.float32]
+) -> float:
+    """σ of showing ``mesh`` with the links at ``T_world_link`` (L, 4, 4); 0 for its own skeleton.
+
+    Not commutative: what is hidden in this mesh stretches when it appears, not the other way round.
+    """
+    return float(distortion_scores(mesh, T_world_link[None], region_weights)[0])
+
+
+def distortion_scores(
+    mesh: RiggedMesh, T_world_links: NDArray[np.float32], region_weights: NDArray[np.float32]
+) -> NDArray[np.float32]:
+    """σ (N,) float32 of one mesh for N skeletons' links (N, L, 4, 4), with ω ``region_weights`` (L,).
+
+    Eq. (1): σ_r = Σ|Δlen(e)| / Σ len(e) over the edges joining region r to others, an edge counting in both its
+    regions. Eq. (2): σ = (1/m) Σ ω_r σ_r over the m regions that have such edges. A mesh without a single one cannot
+    be judged: its σ is infinite.
+    """
+    edges = mesh.joint_edges
+    if len(edges) == 0:
+        return np.full(len(T_world_links), np.inf, np.float32)
+    return _scores(
+        edges.points,
+        edges.rest_lengths,
+        edges.pair_links,
+        edges.pair_starts,
+        edges.region_lengths,
+        region_weights,
+        T_world_links,
+    )
+
+
+class SessionThreshold:
+    """The σ that counts as good in this session: the running mean of the best σ (DISPOSE §5.3).
+
+    ``value`` starts at the paper's 0.15. A fixed threshold does not carry over between sessions: the finer the mesh,
+    the shorter the edges at the joints and the larger the same gap's share of them.
+    """
+
+    def __init__(self, start: float = START_THRESHOLD, memory_frames: int = 300) -> None:
+        self.value = start
+        self.frames = 0
+        self._memory_frames = memory_frames
+
+    def follow(self, best_sigma: float) -> None:
+        """Take in one frame's best σ; infinite ones are no information."""
+        if not np.isfinite(best_sigma):
+            return
+        self.frames += 1
+        self.value += (best_sigma - self.value) / min(self.frames, self._memory_frames)
+
+
+@njit(nogil=True, cache=True, error_model="numpy", fastmath={"reassoc", "contract", "nsz"})
+def _scores(points, rest, pair_links, pair_starts, region_lengths, omega, T):  # type: ignore[no-untyped-def]
+    regions = 0
+    for r in range(len(region_lengths)):
+        regions += region_lengths[r] > 0
+    out = np.zeros(len(T), np.float32)
+    R, t = np.empty((3, 3), np.float32), np.empty(3, np.float32)
+    for n in range(len(T)):
+        for p in range(len(pair_links)):
+            a, b = pair_links[p, 0], pair_links[p, 1]
+            for i in range(3):  # link b seen from link a
+                t[i] = 0
+                for k in range(3):
+                    t[i] += T[n, a, k, i] * (T[n, b, k, 3] - T[n, a, k, 3])
+                for j in range(3):
+                    R[i, j] = T[n, a, 0, i] * T[n, b, 0, j] + T[n, a, 1, i] * T[n, b, 1, j] + T[n, a, 2, i] * T[n, b, 2, j]
+            change = _length_change(points, rest, pair_starts[p], pair_starts[p + 1], R, t)
+            out[n] += change * (omega[a] / region_lengths[a] + omega[b] / region_lengths[b]) / regions
+    return out
+
+
+@njit(nogil=True, cache=True, error_model="numpy", fastmath={"reassoc", "contract", "nsz"})
+def _length_change(points, rest, start, end, R, t):  # type: ignore[no-untyped-def]
+    """Σ|Δlen(e)| [m] over the edges start:end of one pair of links, the second at (R, t) in the first's frame."""
+    r00, r01, r02, r10, r11, r12, r20, r21, r22 = R.ravel()
+    t0, t1, t2 = t
+    total = np.float32(0.0)
+    for e in range(start, end):
+        bx, by, bz = points[3, e], points[4, e], points[5, e]
+        x = r00 * bx + r01 * by + r02 * bz + t0 - points[0, e]
+        y = r10 * bx + r11 * by + r12 * bz + t1 - points[1, e]
+        z = r20 * bx + r21 * by + r22 * bz + t2 - points[2, e]
+        total += abs(np.sqrt(x * x + y * y + z * z) - rest[e])
+    return total

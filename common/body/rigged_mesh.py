@@ -1,0 +1,173 @@
+"""DISPOSE's pose p = {M, S}: a captured mesh, the skeleton it was captured with, and the edges that joins deform.
+
+Sender and receiver build it with this code from the same decoded views and the same decoded skeleton.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from common.body.depth_mesher import mesh_view
+from common.body.link_segmentation import nearest_link
+from common.body.skeleton import LINK_COUNT, Skeleton
+from common.body.skeleton_pose import SkeletonPose, forward_kinematics
+from common.body.view import View
+from common.geometry.rigid_transform import inverse
+from common.geometry.triangle_mesh import TriangleMesh
+
+DRAWN_EDGE_M = 0.06  # longer edges bridge an occlusion: they count in σ, drawn they hang like a skirt
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class JointEdges:
+    """The E edges whose ends lie on different links, grouped by link pair (P pairs): all that σ needs of a mesh.
+
+    ``vertices`` (E, 2) int32: the ends, on the pair's lower and higher link.
+    ``points`` (6, E) float32 [m]: x y z of the lower link's end in that link's frame, then of the higher link's.
+    ``rest_lengths`` (E,) float32 [m] at capture.
+    ``pair_links`` (P, 2) uint8; edges ``pair_starts[p]:pair_starts[p + 1]`` join pair p, ``pair_starts`` (P+1,) int32.
+    ``region_lengths`` (L,) float32 [m]: Σ len(e) of each region, an edge counting in both its regions.
+    """
+
+    vertices: NDArray[np.int32]
+    points: NDArray[np.float32]
+    rest_lengths: NDArray[np.float32]
+    pair_links: NDArray[np.uint8]
+    pair_starts: NDArray[np.int32]
+    region_lengths: NDArray[np.float32]
+
+    def __len__(self) -> int:
+        return len(self.rest_lengths)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RiggedMesh:
+    """A captured person, ready to be moved.
+
+    ``T_link_world`` (L, 4, 4) float64: world at capture → link frames. ``vertex_link`` (V,) uint8.
+    ``mesh.faces`` holds every triangle; ``faces_drawn`` (F', 3) int32 its first F', none of whose edges was longer
+    than 6 cm at capture. The views stay separate surfaces in the one mesh.
+    """
+
+    pose_id: int
+    capture_ns: int
+    skeleton: Skeleton
+    pose: SkeletonPose
+    T_link_world: NDArray[np.float64]
+    mesh: TriangleMesh
+    vertex_link: NDArray[np.uint8]
+    faces_drawn: NDArray[np.int32]
+    joint_edges: JointEdges
+
+    @property
+    def nbytes(self) -> int:
+        """Memory of the arrays [bytes]."""
+        edges = self.joint_edges
+        arrays = (self.mesh.vertices, self.mesh.faces, self.mesh.colours, self.vertex_link, edges.vertices, edges.points)
+        return sum(a.nbytes for a in arrays)
+
+
+def build_rigged_mesh(
+    pose_id: int, capture_ns: int, skeleton: Skeleton, pose: SkeletonPose, views: Sequence[View]
+) -> RiggedMesh:
+    """Mesh all views of one instant and rig them to the skeleton of that instant.
+
+    Raises:
+        ValueError: the views hold no triangle.
+    """
+    mesh, drawn_count = _drawn_first(_merged([mesh_view(view) for view in views]))
+    if len(mesh.faces) == 0:
+        raise ValueError(f"pose {pose_id}: its {len(views)} views hold no surface")
+    T_world_link = forward_kinematics(skeleton, pose)
+    T_link_world = inverse(T_world_link.astype(np.float64))
+    vertex_link = nearest_link(mesh.vertices, skeleton, T_world_link)
+    edges = joint_edges(mesh, vertex_link, T_link_world)
+    return RiggedMesh(
+        pose_id, capture_ns, skeleton, pose, T_link_world, mesh, vertex_link, mesh.faces[:drawn_count], edges
+    )
+
+
+def joint_edges(
+    mesh: TriangleMesh, vertex_link: NDArray[np.uint8], T_link_world: NDArray[np.float64]
+) -> JointEdges:
+    """Collect the edges between links, each once, sorted by link pair.
+
+    ``vertex_link`` (V,) uint8, ``T_link_world`` (L, 4, 4): as in ``RiggedMesh``.
+    """
+    count = len(mesh.vertices)
+    keys = np.unique(_joining_edge_keys(mesh.faces, vertex_link, count))
+    pair, ends = np.divmod(keys, count * count)
+    vertices = np.stack(np.divmod(ends, count), axis=1).astype(np.int32)
+    starts = np.flatnonzero(np.diff(pair, prepend=-1))
+    links = np.stack(np.divmod(pair, LINK_COUNT), axis=1).astype(np.uint8)
+    a, b = (
+        np.einsum("eij,ej->ei", T_link_world[links[:, k], :3, :3], mesh.vertices[vertices[:, k]])
+        + T_link_world[links[:, k], :3, 3]
+        for k in (0, 1)
+    )
+    lengths = np.linalg.norm(mesh.vertices[vertices[:, 0]] - mesh.vertices[vertices[:, 1]], axis=1)
+    regions = sum(np.bincount(links[:, k], weights=lengths, minlength=LINK_COUNT) for k in (0, 1))
+    return JointEdges(
+        vertices=vertices,
+        points=np.ascontiguousarray(np.concatenate([a, b], axis=1).T, np.float32),
+        rest_lengths=lengths.astype(np.float32),
+        pair_links=np.ascontiguousarray(links[starts]),
+        pair_starts=np.append(starts, len(keys)).astype(np.int32),
+        region_lengths=np.asarray(regions, np.float32),
+    )
+
+
+def _merged(meshes: Sequence[TriangleMesh]) -> TriangleMesh:
+    """One mesh of several, their surfaces unconnected."""
+    if not meshes:
+        return TriangleMesh(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32), np.zeros((0, 3), np.uint8))
+    first = np.cumsum([0, *(len(m.vertices) for m in meshes[:-1])], dtype=np.int32)
+    return TriangleMesh(
+        np.concatenate([m.vertices for m in meshes]),
+        np.concatenate([m.faces + offset for m, offset in zip(meshes, first, strict=True)]),
+        np.concatenate([m.colours for m in meshes]),
+    )
+
+
+def _drawn_first(mesh: TriangleMesh) -> tuple[TriangleMesh, int]:
+    """The mesh with its drawn triangles in front, and their number: what is drawn is then a slice, not a copy."""
+    longest_squared = _longest_edges_squared(mesh.vertices, mesh.faces)
+    drawn = longest_squared <= DRAWN_EDGE_M**2
+    faces = np.concatenate([mesh.faces[drawn], mesh.faces[~drawn]])
+    return TriangleMesh(mesh.vertices, faces, mesh.colours), int(np.count_nonzero(drawn))
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _longest_edges_squared(vertices, faces):  # type: ignore[no-untyped-def]
+    out = np.zeros(len(faces), np.float32)
+    for f in range(len(faces)):
+        for k in range(3):
+            a, b = faces[f, k], faces[f, (k + 1) % 3]
+            x = vertices[a, 0] - vertices[b, 0]
+            y = vertices[a, 1] - vertices[b, 1]
+            z = vertices[a, 2] - vertices[b, 2]
+            out[f] = max(out[f], x * x + y * y + z * z)
+    return out
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _joining_edge_keys(faces, vertex_link, vertex_count):  # type: ignore[no-untyped-def]
+    """Keys (E',) int64 of the edges between links, twice where two triangles share one: pair, lower end, higher end."""
+    keys = np.empty(3 * len(faces), np.int64)
+    count = 0
+    for f in range(len(faces)):
+        for k in range(3):
+            a, b = np.int64(faces[f, k]), np.int64(faces[f, (k + 1) % 3])
+            if vertex_link[a] == vertex_link[b]:
+                continue
+            if vertex_link[a] > vertex_link[b]:
+                a, b = b, a
+            pair = np.int64(vertex_link[a]) * LINK_COUNT + np.int64(vertex_link[b])
+            keys[count] = (pair * vertex_count + a) * vertex_count + b
+            count += 1
+    return keys[:count].copy()

@@ -1,0 +1,58 @@
+"""The newest skeleton wins; everything else is counted (DISPOSE §6.2: latency is the skeleton's alone).
+
+A sender run is an *epoch*. The first packet of an unknown epoch starts it and retires the one before, so that nothing
+late from an old run is ever shown again.
+"""
+
+from __future__ import annotations
+
+from collections import Counter, deque
+
+from common.wire.skeleton_packet import SkeletonPacket
+
+RETIRED_EPOCHS = 16
+CLOCK_SLACK_NS = 2_000_000_000
+FASTEST_RATE_HZ = 240
+
+
+class SkeletonBuffer:
+    """Judges each arriving packet. ``counts``: accepted, duplicate, stale, old_epoch, far_future, lost, epochs."""
+
+    def __init__(self) -> None:
+        self.newest: SkeletonPacket | None = None
+        self.counts: Counter[str] = Counter()
+        self._arrival_ns = 0
+        self._retired: deque[int] = deque(maxlen=RETIRED_EPOCHS)
+
+    def push(self, packet: SkeletonPacket, now_ns: int) -> bool:
+        """Take a packet that arrived at ``now_ns`` (receiver's monotonic clock); True when it is the one to show."""
+        verdict = self._judge(packet, now_ns)
+        self.counts[verdict] += 1
+        if verdict != "accepted":
+            return False
+        if self.newest is None or packet.epoch != self.newest.epoch:
+            self.counts["epochs"] += 1
+            if self.newest is not None:
+                self._retired.append(self.newest.epoch)
+        else:
+            self.counts["lost"] += packet.sequence - self.newest.sequence - 1
+        self.newest, self._arrival_ns = packet, now_ns
+        return True
+
+    def _judge(self, packet: SkeletonPacket, now_ns: int) -> str:
+        newest = self.newest
+        if packet.epoch in self._retired:
+            return "old_epoch"
+        if newest is None or packet.epoch != newest.epoch:
+            return "accepted"
+        if packet.sequence == newest.sequence:
+            return "duplicate"
+        if packet.sequence < newest.sequence or packet.capture_ns <= newest.capture_ns:
+            return "stale"
+        # A forged or broken packet from the future would make every honest one after it stale.
+        advance_ns = packet.capture_ns - newest.capture_ns
+        if advance_ns > now_ns - self._arrival_ns + CLOCK_SLACK_NS:
+            return "far_future"
+        if packet.sequence - newest.sequence > FASTEST_RATE_HZ * (advance_ns / 1e9 + 1):
+            return "far_future"
+        return "accepted"

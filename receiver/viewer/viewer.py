@@ -1,0 +1,107 @@
+"""What the receiver shows to: one interface for the page, the offscreen renderer and nobody at all.
+
+The receiver's daemon calls a viewer on its own loop, in this order: poses enter and leave with the repository, then
+frames name the pose they move. A viewer never blocks and never queues without a bound.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import TYPE_CHECKING, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from common.body.skeleton import LINK_COUNT
+
+if TYPE_CHECKING:
+    from common.body.rigged_mesh import RiggedMesh
+
+
+class ConnectionState(StrEnum):
+    """What the receiver knows of its sender."""
+
+    WAITING = "waiting for sender"
+    RECEIVING = "receiving"
+    LOST = "connection lost"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ShownFrame:
+    """One instant on screen: which candidate pose is drawn and how its links moved since it was captured.
+
+    ``capture_ns``: the sender's capture time of the skeleton [ns]. ``pose_id``: the candidate pose drawn; None while
+    the repository is empty (then ``motion`` is None too and only the joints are known).
+    ``motion`` (L, 3, 4) float32: T_world_link(now) · T_link_world(at capture), moves the mesh's world vertices.
+    ``joints`` (L, 3) float32 [m, world]: link origins. ``sigma``: distortion score σ of the drawn pose (nan: none).
+    ``fit_confidence``: 0..1. ``confidence`` (L,) float32: 0 = that link was not seen.
+    ``age_ms``: time from capture to this call [ms], nan while the clock offset to the sender is unknown.
+
+    Raises:
+        ValueError: wrong shapes, or a motion without a pose.
+    """
+
+    capture_ns: int
+    sequence: int
+    pose_id: int | None
+    motion: NDArray[np.float32] | None
+    joints: NDArray[np.float32]
+    sigma: float
+    fit_confidence: float
+    confidence: NDArray[np.float32]
+    age_ms: float = float("nan")
+
+    def __post_init__(self) -> None:
+        if (self.pose_id is None) != (self.motion is None):
+            raise ValueError("a shown frame has a pose and its motion, or neither")
+        if self.motion is not None and self.motion.shape != (LINK_COUNT, 3, 4):
+            raise ValueError(f"motion: expected {(LINK_COUNT, 3, 4)}, got {self.motion.shape}")
+        if self.joints.shape != (LINK_COUNT, 3) or self.confidence.shape != (LINK_COUNT,):
+            raise ValueError(f"joints {self.joints.shape}, confidence {self.confidence.shape}: not {LINK_COUNT} links")
+
+
+@dataclass(frozen=True, slots=True)
+class ViewerStatus:
+    """The figures beside the picture, a few times a second.
+
+    ``detail``: one sentence for a person where something is missing ("no person in view"), else "".
+    ``frame_rate_hz``: skeletons received per second. ``pose_age_ms``: capture to screen [ms], None while unknown.
+    ``skeleton_bps``, ``bulk_bps``: payload received [bit/s]. ``chosen_pose``: id of the pose drawn, None = none.
+    ``sigma``: its distortion score σ, None = none.
+    """
+
+    connection: ConnectionState = ConnectionState.WAITING
+    detail: str = ""
+    frame_rate_hz: float = 0.0
+    pose_age_ms: float | None = None
+    skeleton_bps: float = 0.0
+    bulk_bps: float = 0.0
+    repository_poses: int = 0
+    chosen_pose: int | None = None
+    sigma: float | None = None
+
+
+class Viewer(Protocol):
+    """Shows one person. Poses are added before the first frame that names them."""
+
+    def add_pose(self, mesh: RiggedMesh) -> None: ...
+    def remove_pose(self, pose_id: int) -> None: ...
+    def show(self, frame: ShownFrame) -> None: ...
+    def set_status(self, status: ViewerStatus) -> None: ...
+
+
+class NullViewer:
+    """Shows nothing; the receiver runs the same without a screen."""
+
+    def add_pose(self, mesh: RiggedMesh) -> None:
+        """Ignores the pose."""
+
+    def remove_pose(self, pose_id: int) -> None:
+        """Ignores the pose."""
+
+    def show(self, frame: ShownFrame) -> None:
+        """Ignores the frame."""
+
+    def set_status(self, status: ViewerStatus) -> None:
+        """Ignores the figures."""

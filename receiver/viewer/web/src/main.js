@@ -1,0 +1,77 @@
+// The page: messages in, person on the stage, figures on the HUD.
+
+import "./style.css";
+import { connect } from "./connection.js";
+import { Hud } from "./hud.js";
+import { Person } from "./person.js";
+import { SkeletonOverlay } from "./skeleton.js";
+import { Stage } from "./stage.js";
+
+const hud = new Hud();
+const stage = new Stage(document.getElementById("stage"));
+const person = new Person(stage.scene);
+const skeleton = new SkeletonOverlay(stage.scene);
+
+let newest = null; // the frame to draw next; an older one not drawn yet is skipped
+let arrivedAt = 0;
+let drawnAt = performance.now();
+
+connect({
+  hello({ link_parents }) {
+    person.clear(); // a new connection starts with an empty repository
+    skeleton.setLinks(link_parents);
+  },
+  status(status) {
+    hud.setStatus(status);
+    setPresence();
+  },
+  pose: (message) => person.add(message),
+  remove: ({ poseId }) => person.remove(poseId),
+  frame(frame) {
+    newest = frame;
+    arrivedAt = performance.now();
+  },
+  outdated: () => hud.setState("outdated"),
+  closed() {
+    hud.setState("disconnected");
+    setPresence();
+  },
+});
+
+function setPresence() {
+  person.presence = hud.live ? 1 : 0;
+  stage.changed = true;
+}
+
+function draw(now) {
+  requestAnimationFrame(draw);
+  if (newest) {
+    person.show(newest);
+    skeleton.show(newest);
+    stage.follow(newest.joints, (now - drawnAt) / 1000);
+    hud.countFrame(newest.ageMs + performance.now() - arrivedAt);
+    newest = null;
+    drawnAt = now;
+  }
+  stage.draw();
+  hud.tick(now);
+}
+requestAnimationFrame(draw);
+
+const KEYS = {
+  s: () => skeleton.toggle(),
+  r: () => stage.front(),
+  h: () => document.body.classList.toggle("quiet"),
+};
+
+function press(key) {
+  KEYS[key]?.();
+  stage.changed = true;
+}
+
+addEventListener("keydown", (event) => {
+  if (!event.ctrlKey && !event.metaKey && !event.altKey && !event.repeat) press(event.key.toLowerCase());
+});
+for (const button of document.querySelectorAll("[data-key]")) {
+  button.addEventListener("click", () => press(button.dataset.key));
+}

@@ -1,0 +1,48 @@
+// The page's end of receiver/viewer/page_messages.py: typed arrays read in place, little-endian.
+
+export const VERSION = 1;
+const KINDS = { 1: decodePose, 2: decodeFrame, 3: decodeRemove };
+const NO_POSE = 0xffffffff;
+export const LINKS = 23;
+
+/** One message as {kind, ...}: JSON text or binary. */
+export function decodeMessage(data) {
+  if (typeof data === "string") return JSON.parse(data);
+  const view = new DataView(data);
+  return KINDS[view.getUint8(1)](data, view);
+}
+
+function decodePose(buffer, view) {
+  const vertices = view.getUint32(8, true);
+  const faces = view.getUint32(12, true);
+  const colourOffset = 40 + align(vertices * 6);
+  return {
+    kind: "pose",
+    poseId: view.getUint32(4, true),
+    boxMin: new Float32Array(buffer, 16, 3),
+    boxSize: new Float32Array(buffer, 28, 3),
+    positions: new Uint16Array(buffer, 40, vertices * 3),
+    coloursAndLinks: new Uint8Array(buffer, colourOffset, vertices * 4),
+    indices: new Uint32Array(buffer, colourOffset + vertices * 4, faces * 3),
+  };
+}
+
+function decodeFrame(buffer, view) {
+  const poseId = view.getUint32(4, true);
+  return {
+    kind: "frame",
+    poseId: poseId === NO_POSE ? null : poseId,
+    ageMs: view.getFloat32(20, true),
+    motion: new Float32Array(buffer, 24, LINKS * 12),
+    joints: new Float32Array(buffer, 24 + LINKS * 48, LINKS * 3),
+    confidence: new Uint8Array(buffer, 24 + LINKS * 60, LINKS),
+  };
+}
+
+function decodeRemove(buffer, view) {
+  return { kind: "remove", poseId: view.getUint32(4, true) };
+}
+
+function align(bytes) {
+  return (bytes + 3) & ~3;
+}

@@ -1,0 +1,98 @@
+"""The sender's settings: one TOML file, one tree of frozen dataclasses; ``deploy/sender.toml`` explains each key."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+from common.transport.zenoh_session import LinkSettings
+
+from common.runtime.metrics import MetricsSettings
+
+
+@dataclass(frozen=True, slots=True)
+class CaptureSettings:
+    """Where frames come from. ``source``: "virtual" (a rig process of our own), "rig" (attach to a running one at
+    ``rig_socket``) or "recording" (``recording`` is a folder or file)."""
+
+    source: Literal["virtual", "rig", "recording"] = "virtual"
+    body: str = "builtin"
+    motion: str | None = None
+    data: Path | None = None
+    cameras: int = 4
+    width: int = 640
+    height: int = 480
+    frame_rate_hz: float = 30.0
+    noise: bool = True
+    seed: int = 0
+    rig_socket: Path | None = None
+    recording: Path | None = None
+    realtime: bool = True
+    loop: bool = False
+    patience_ms: float = 20.0
+
+    def __post_init__(self) -> None:
+        if self.source == "recording" and self.recording is None:
+            raise ValueError("recording: a recording source needs a folder or file")
+        if self.source == "rig" and self.rig_socket is None:
+            raise ValueError("rig_socket: attaching to a rig needs the path of its socket")
+        if not 1 <= self.cameras <= 16:
+            raise ValueError(f"cameras: {self.cameras} is outside 1..16")
+        if not 1 <= self.frame_rate_hz <= 120:
+            raise ValueError(f"frame_rate_hz: {self.frame_rate_hz} is outside 1..120")
+        if not 0 <= self.patience_ms <= 1000:
+            raise ValueError(f"patience_ms: {self.patience_ms} is outside 0..1000")
+
+
+@dataclass(frozen=True, slots=True)
+class TrackingSettings:
+    """``points``: how many points of each frame's cloud the tracker is given."""
+
+    points: int = 2500
+
+    def __post_init__(self) -> None:
+        if not 100 <= self.points <= 50_000:
+            raise ValueError(f"points: {self.points} is outside 100..50000")
+
+
+@dataclass(frozen=True, slots=True)
+class CandidateSettings:
+    """Candidate poses. ``interval_ms``: time between two that are considered. ``least_confidence``: of a fit, for its
+    frame to become one. ``jpeg_quality``, ``depth_step_mm``: how finely a view is sent."""
+
+    enabled: bool = True
+    interval_ms: float = 200.0
+    least_confidence: float = 0.5
+    jpeg_quality: int = 85
+    depth_step_mm: int = 2
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.interval_ms <= 60_000:
+            raise ValueError(f"interval_ms: {self.interval_ms} is outside 0..60000")
+        if not 0 <= self.least_confidence <= 1:
+            raise ValueError(f"least_confidence: {self.least_confidence} is outside 0..1")
+        if not 30 <= self.jpeg_quality <= 100:
+            raise ValueError(f"jpeg_quality: {self.jpeg_quality} is outside 30..100")
+        if not 1 <= self.depth_step_mm <= 16:
+            raise ValueError(f"depth_step_mm: {self.depth_step_mm} is outside 1..16")
+
+
+@dataclass(frozen=True, slots=True)
+class SenderSettings:
+    """``site`` and ``person`` name the stream. ``state_folder`` keeps the body found, so that a restarted sender goes
+    on in mid-motion (None: the user's state folder). ``stats_file``: figures written at the end, as JSON."""
+
+    site: str = "studio"
+    person: int = 0
+    state_folder: Path | None = None
+    stats_file: Path | None = None
+    link: LinkSettings = field(default_factory=lambda: LinkSettings(listen=("tcp/127.0.0.1:7447",)))
+    capture: CaptureSettings = field(default_factory=CaptureSettings)
+    tracking: TrackingSettings = field(default_factory=TrackingSettings)
+    poses: CandidateSettings = field(default_factory=CandidateSettings)
+    http: MetricsSettings = field(default_factory=lambda: MetricsSettings(port=9101))
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.person <= 255:
+            raise ValueError(f"person: {self.person} is outside 0..255")

@@ -1,0 +1,261 @@
+"""The person as the tracker knows them: sizes, and the surface of each link in the link's own frame (P_l, Lien §5.1.1).
+
+Points are running averages in small cells, so the model is bounded, gets better with every frame that is added, and
+one bad frame is soon outvoted. A model can be saved, and a restarted sender goes on with it in mid-motion.
+"""
+
+from __future__ import annotations
+
+import io
+import zipfile
+from typing import Any
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from common.body.skeleton import LINK_COUNT, LINK_INDEX, LINK_PARENTS, Skeleton
+from common.body.skeleton_pose import bone_segments
+from common.geometry.point_cloud import PointCloud
+from sender.fitting.articulated_gauss_newton import Surface
+from sender.fitting.closest_point_grid import LinkGrid, build_link_grid
+
+Array = NDArray[Any]
+
+FORMAT_VERSION = 1
+MAX_BYTES = 8_000_000
+MAX_POINTS_PER_LINK = 4_000
+CELL_M = 0.012  # one model point per cell and facing
+GRID_CELL_M, GRID_MARGIN_M = 0.015, 0.06
+MEMORY_FRAMES = 90.0  # a cell forgets what is older than about this many observations
+SEAM_WEIGHT = 0.4  # points a neighbouring link also claims bend with the joint and follow neither link well
+SEAM_RATIO = 1.35  # claimed by both when the second bone is at most this much further, in radii
+
+_UNSPLIT = {"fingers": "hand", "toes": "foot"}  # locked joints: their points belong to the link that moves them
+
+
+class BodyModel:
+    """Surface points per link, gathered from clouds with known poses.
+
+    ``skeleton``: sizes; ``revision`` counts changes of the surface (``surface()`` is rebuilt when it moved).
+    """
+
+    def __init__(self, skeleton: Skeleton) -> None:
+        self.skeleton = skeleton
+        self.revision = 0
+        self._cells = [_LinkCells() for _ in range(LINK_COUNT)]
+        self._grids: list[LinkGrid | None] = [None] * LINK_COUNT
+        self._surface: Surface | None = None
+
+    @property
+    def point_count(self) -> int:
+        """Surface points of all links."""
+        return sum(len(cells.keys) for cells in self._cells)
+
+    def add(self, cloud: PointCloud, T_world_link: Array) -> None:
+        """Adds a cloud whose pose is ``T_world_link`` (L, 4, 4) [world]; each point goes to the bone it is nearest to,
+        measured in that bone's radii, and near a joint to both bones."""
+        starts, ends = bone_segments(self.skeleton, T_world_link)
+        first, second, ratio = nearest_bones(cloud.positions, starts, ends, self.skeleton.radii)
+        first, second = _MOVER[first], _MOVER[second]
+        seam = (ratio < SEAM_RATIO) & (first != second) & _JOINED[first, second]
+        self.add_assigned(cloud, T_world_link, first, np.where(seam, SEAM_WEIGHT, 1.0))
+        picked = PointCloud(cloud.positions[seam], cloud.normals[seam], cloud.colours[seam])
+        self.add_assigned(picked, T_world_link, second[seam], np.full(int(seam.sum()), SEAM_WEIGHT))
+
+    def add_assigned(self, cloud: PointCloud, T_world_link: Array, links: Array, weights: Array) -> None:
+        """Adds points whose link is known: ``links`` (N,) int, -1 = leave out; ``weights`` (N,) 0..1 rigidity."""
+        for link in np.unique(links[links >= 0]):
+            chosen = links == link
+            T = T_world_link[link].astype(np.float64)
+            points = (cloud.positions[chosen] - T[:3, 3]) @ T[:3, :3]
+            normals = cloud.normals[chosen] @ T[:3, :3]
+            self._cells[link].add(points, normals, cloud.colours[chosen].astype(np.float64), weights[chosen])
+            self._grids[link] = None
+        self.revision += 1
+        self._surface = None
+
+    def rescaled(self, skeleton: Skeleton) -> None:
+        """Takes new sizes; the surface stays where it is in the links' frames."""
+        self.skeleton = skeleton
+
+    def surface(self) -> Surface:
+        """All links' points and closest-point grids; only links that changed are built again."""
+        if self._surface is None:
+            for link, cells in enumerate(self._cells):
+                if self._grids[link] is None:
+                    points, normals, _ = cells.surface()
+                    self._grids[link] = build_link_grid(points, normals, GRID_CELL_M, GRID_MARGIN_M)
+            grids = [grid for grid in self._grids if grid is not None]
+            self._surface = _join(grids, [cells.rigidity() for cells in self._cells])
+        return self._surface
+
+    def to_bytes(self) -> bytes:
+        """The model as a compressed npz archive, at most ``MAX_BYTES``."""
+        counts = np.array([len(cells.keys) for cells in self._cells], np.int32)
+        sums = np.concatenate([cells.sums for cells in self._cells]).astype(np.float32)
+        out = io.BytesIO()
+        np.savez_compressed(
+            out,
+            version=np.int32(FORMAT_VERSION),
+            offsets=self.skeleton.offsets,
+            tips=self.skeleton.tips,
+            radii=self.skeleton.radii,
+            counts=counts,
+            sums=sums,
+        )
+        return out.getvalue()
+
+    @classmethod
+    def from_bytes(cls, data: bytes) -> BodyModel:
+        """The model ``to_bytes`` wrote.
+
+        Raises:
+            ValueError: not such an archive, another version, or sizes and values that cannot be; says which.
+        """
+        version, offsets, tips, radii, counts, sums = _read_archive(data)
+        if version.shape != () or int(version) != FORMAT_VERSION:
+            raise ValueError(f"body model: version {version}, this program reads {FORMAT_VERSION}")
+        if counts.shape != (LINK_COUNT,) or counts.min() < 0 or counts.max() > MAX_POINTS_PER_LINK:
+            raise ValueError(f"body model: point counts of {counts.shape} links do not fit {LINK_COUNT} links")
+        if sums.shape != (int(counts.sum()), _COLUMNS) or not np.isfinite(sums).all() or np.abs(sums).max(initial=0) > 1e6:
+            raise ValueError(f"body model: points {sums.shape} do not match their counts or are not finite")
+        if len(sums) and sums[:, _COUNT].min() <= 0:
+            raise ValueError("body model: a point without observations")
+        try:
+            body = cls(Skeleton(offsets, tips, radii))
+        except (ValueError, TypeError) as error:
+            raise ValueError(f"body model: {error}") from error
+        ends = np.cumsum(counts)
+        for cells, end, count in zip(body._cells, ends, counts, strict=True):
+            cells.restore(sums[end - count : end].astype(np.float64))
+        return body
+
+
+def _read_archive(data: bytes) -> tuple[Array, ...]:
+    if len(data) > MAX_BYTES:
+        raise ValueError(f"body model: {len(data)} bytes, at most {MAX_BYTES}")
+    try:
+        with zipfile.ZipFile(io.BytesIO(data)) as archive:
+            if sum(entry.file_size for entry in archive.infolist()) > 4 * MAX_BYTES:
+                raise ValueError("body model: unpacks to more than is plausible")
+        with np.load(io.BytesIO(data), allow_pickle=False) as stored:
+            return tuple(stored[name] for name in ("version", "offsets", "tips", "radii", "counts", "sums"))
+    except ValueError:
+        raise
+    except Exception as error:  # zipfile, zlib, struct and numpy each have their own way to say "broken"
+        raise ValueError(f"body model: not a readable archive ({type(error).__name__}: {error})") from error
+
+
+_POSITION, _NORMAL, _COLOUR, _RIGID, _COUNT, _COLUMNS = slice(0, 3), slice(3, 6), slice(6, 9), 9, 10, 11
+
+
+class _LinkCells:
+    """Running sums of one link's points, keyed by cell and main direction of the normal; rows are sorted by key."""
+
+    def __init__(self) -> None:
+        self.keys = np.empty(0, np.int64)
+        self.sums = np.empty((0, _COLUMNS))
+
+    def add(self, points: Array, normals: Array, colours: Array, rigid: Array) -> None:
+        rows = np.concatenate([points, normals, colours, rigid[:, None], np.ones((len(points), 1))], axis=1)
+        keys, inverse = np.unique(np.concatenate([self.keys, _cell_keys(points, normals)]), return_inverse=True)
+        sums = np.zeros((len(keys), _COLUMNS))
+        np.add.at(sums, inverse[: len(self.keys)], self.sums)
+        np.add.at(sums, inverse[len(self.keys) :], rows)
+        sums /= np.maximum(sums[:, _COUNT :_COLUMNS] / MEMORY_FRAMES, 1.0)
+        if len(keys) > MAX_POINTS_PER_LINK:  # keep what was seen most often
+            kept = np.sort(np.argsort(-sums[:, _COUNT], kind="stable")[:MAX_POINTS_PER_LINK])
+            keys, sums = keys[kept], sums[kept]
+        self.keys, self.sums = keys, sums
+
+    def restore(self, sums: Array) -> None:
+        points = sums[:, _POSITION] / sums[:, _COUNT :]
+        keys = _cell_keys(points, sums[:, _NORMAL])
+        self.keys, first = np.unique(keys, return_index=True)
+        self.sums = sums[first]
+
+    def surface(self) -> tuple[Array, Array, Array]:
+        """Points (M, 3) [m, link frame], unit normals (M, 3), colours (M, 3) uint8."""
+        count = self.sums[:, _COUNT :]
+        normals = self.sums[:, _NORMAL]
+        normals = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-9)
+        return self.sums[:, _POSITION] / count, normals, (self.sums[:, _COLOUR] / count).astype(np.uint8)
+
+    def rigidity(self) -> Array:
+        return self.sums[:, _RIGID] / self.sums[:, _COUNT]
+
+
+def _cell_keys(points: Array, normals: Array) -> Array:
+    cell = np.clip(np.floor(points / CELL_M), -(1 << 17), (1 << 17) - 1).astype(np.int64) + (1 << 17)
+    axis = np.argmax(np.abs(normals), axis=1)
+    facing = 2 * axis + (np.take_along_axis(normals, axis[:, None], 1)[:, 0] < 0)
+    return (((facing << 18 | cell[:, 0]) << 18 | cell[:, 1]) << 18) | cell[:, 2]
+
+
+def _join(grids: list[LinkGrid], rigidity: list[Array]) -> Surface:
+    counts = np.array([len(grid.points) for grid in grids])
+    cells = np.array([grid.nearest.size for grid in grids])
+    low, high = np.ones((LINK_COUNT, 3), np.float32), np.zeros((LINK_COUNT, 3), np.float32)
+    for link, grid in enumerate(grids):
+        if len(grid.points):
+            low[link], high[link] = grid.points.min(0), grid.points.max(0)
+    return Surface(
+        points=np.concatenate([grid.points for grid in grids]),
+        normals=np.concatenate([grid.normals for grid in grids]),
+        weights=np.concatenate(rigidity).astype(np.float32),
+        first_point=np.cumsum(counts) - counts,
+        origin=np.stack([grid.origin for grid in grids]),
+        shape=np.array([grid.nearest.shape[1:] for grid in grids], np.int64),
+        cell_m=np.array([grid.cell_m for grid in grids], np.float32),
+        first_cell=np.cumsum(cells) - cells,
+        nearest=np.concatenate([grid.nearest.ravel() for grid in grids]),
+        low=low,
+        high=high,
+    )
+
+
+def _movers() -> Array:
+    movers = np.arange(LINK_COUNT)
+    for side in ("left", "right"):
+        for tip, link in _UNSPLIT.items():
+            movers[LINK_INDEX[f"{side}_{tip}"]] = LINK_INDEX[f"{side}_{link}"]
+    return movers
+
+
+def _joined() -> Array:
+    joined = np.zeros((LINK_COUNT, LINK_COUNT), bool)
+    for link, parent in enumerate(LINK_PARENTS[1:], start=1):
+        joined[link, parent] = joined[parent, link] = True
+    return joined
+
+
+_MOVER, _JOINED = _movers(), _joined()
+
+
+@njit(nogil=True, cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+def nearest_bones(points: Array, starts: Array, ends: Array, radii: Array) -> tuple[Array, Array, Array]:
+    """Nearest and second nearest bone (N,), (N,) int64 of ``points`` (N, 3) [m, world] by distance ÷ radius, and the
+    ratio (N,) of the two distances; ``starts, ends`` (L, 3) [m, world], ``radii`` (L,) [m]."""
+    first, second = np.empty(len(points), np.int64), np.empty(len(points), np.int64)
+    ratio = np.empty(len(points))
+    for n in range(len(points)):
+        best, next_best = np.inf, np.inf
+        first[n] = second[n] = 0
+        for link in range(len(radii)):
+            along, length, d = 0.0, 1e-12, 0.0
+            for i in range(3):
+                bone = ends[link, i] - starts[link, i]
+                along += bone * (points[n, i] - starts[link, i])
+                length += bone * bone
+            along = min(max(along / length, 0.0), 1.0)
+            for i in range(3):
+                off = points[n, i] - starts[link, i] - along * (ends[link, i] - starts[link, i])
+                d += off * off
+            d = np.sqrt(d) / radii[link]
+            if d < best:
+                best, next_best, second[n], first[n] = d, best, first[n], link
+            elif d < next_best:
+                next_best, second[n] = d, link
+        ratio[n] = next_best / max(best, 1e-6)
+    return first, second, ratio

@@ -1,0 +1,110 @@
+"""Finding an arm or a leg again after it jumped (algorithms.md §8: limb re-search).
+
+Gauss–Newton follows a limb only as far as its points still find it. When a limb no longer explains what lies around it,
+a fixed set of its poses (every direction of its first bone, turned about it, bent more or less) is scored on the points
+that the rest of the body does not explain; the best few go back to Gauss–Newton.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from common.body.skeleton import LINK_INDEX, SIDES
+from common.geometry import quaternion
+from sender.fitting.articulated_gauss_newton import INLIER_M, PoseState, Surface, closest_point
+from sender.fitting.joint_limits import JointTable
+
+Array = NDArray[Any]
+
+_SWINGS, _TWISTS, _BENDS = 6, 5, 4  # samples per angle range
+_HINGE = {"forearm": 1, "shin": 0}  # axis about which the middle joint bends
+
+
+class Limb(NamedTuple):
+    """``links`` (3,) int64: first, middle and end link; ``poses`` (K, 3, 3, 3) float64: local rotations to try."""
+
+    links: Array
+    poses: Array
+
+
+def limbs(table: JointTable) -> tuple[Limb, ...]:
+    """The four limbs with all poses worth trying."""
+    chains = (("upper_arm", "forearm", "hand"), ("thigh", "shin", "foot"))
+    return tuple(_limb([f"{side}_{part}" for part in chain], table) for side in SIDES for chain in chains)
+
+
+def _limb(names: list[str], table: JointTable) -> Limb:
+    links = np.array([LINK_INDEX[name] for name in names])
+    first, middle = links[0], links[1]
+    twist_axis = int(table.twist_axis[first])
+    swing_axes = [axis for axis in range(3) if axis != twist_axis]
+    hinge = _HINGE[names[1].partition("_")[2]]
+    bends = np.linspace(table.low[middle, hinge], table.high[middle, hinge], _BENDS + 1)
+    bends = bends[1:] if bends[0] < 0 and abs(bends[0]) > abs(bends[-1]) else bends[:-1]  # a fully closed hinge is rare
+    ranges = [np.linspace(table.low[first, axis], table.high[first, axis], _SWINGS) for axis in swing_axes]
+    grid = np.stack(np.meshgrid(*ranges, indexing="ij"), -1).reshape(-1, 2)
+    grid = grid[np.hypot(*grid.T) < 2.6]  # beyond, the same direction is reached the other way round
+    twists = np.linspace(table.low[first, twist_axis], table.high[first, twist_axis], _TWISTS)
+    poses = []
+    for swing in grid:
+        swing_vector = np.zeros(3)
+        swing_vector[swing_axes] = swing
+        for twist in twists:
+            upper = quaternion.multiply(quaternion.from_rotation_vector(swing_vector), _turn(twist_axis, twist))
+            poses += [(upper, _turn(hinge, bend), quaternion.IDENTITY) for bend in bends]
+    return Limb(links, quaternion.to_matrix(np.array(poses)))
+
+
+def _turn(axis: int, angle: float) -> Array:
+    return quaternion.from_rotation_vector(np.eye(3)[axis] * angle)
+
+
+def nearby_poses(limb: Limb, local: Array, table: JointTable) -> Array:
+    """Poses (K, 3, 3, 3) that keep the first bone's direction of ``local`` (L, 3, 3) and try every turn and bend."""
+    first = local[limb.links[0]]
+    twist_axis = int(table.twist_axis[limb.links[0]])
+    turns = quaternion.to_matrix(np.stack([_turn(twist_axis, a) for a in np.radians(np.arange(-160, 161, 20))]))
+    bends = np.unique(limb.poses[:, 1].round(6), axis=0)
+    out = np.empty((len(turns), len(bends), 3, 3, 3))
+    out[:, :, 0] = (first @ turns)[:, None]
+    out[:, :, 1] = bends
+    out[:, :, 2] = np.eye(3)
+    return out.reshape(-1, 3, 3, 3)
+
+
+def with_limb(state: PoseState, limb: Limb, pose: Array) -> PoseState:
+    """``state`` with the limb's local rotations replaced by ``pose`` (3, 3, 3)."""
+    local = state.local.copy()
+    local[limb.links] = pose
+    return PoseState(state.root, local)
+
+
+@njit(nogil=True, cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+def score_poses(
+    points: Array, normals: Array, R: Array, t: Array, links: Array, poses: Array, offsets: Array, surface: Surface,
+    parents: Array,
+) -> Array:
+    """Mean robust cost (K,) 0..1 of ``points, normals`` (N, 3) [m, world] against one limb in each of ``poses``
+    (K, 3, 3, 3); ``R, t``: the body's link rotations (L, 3, 3) and joints (L, 3), overwritten for ``links``."""
+    cost = np.zeros(len(poses))
+    near = np.empty((len(points), len(links)), np.int8)
+    near[:] = links
+    for k in range(len(poses)):
+        for c in range(len(links)):
+            link, up = links[c], parents[links[c]]
+            for i in range(3):
+                t[link, i] = t[up, i]
+                for j in range(3):
+                    t[link, i] += R[up, i, j] * offsets[link, j]
+                    R[link, i, j] = 0.0
+                    for m in range(3):
+                        R[link, i, j] += R[up, i, m] * poses[k, c, m, j]
+        for n in range(len(points)):
+            hit, _, d2 = closest_point(points, normals, near, n, R, t, surface)
+            cost[k] += d2 / (d2 + INLIER_M**2) if hit >= 0 else 1.0
+        cost[k] /= max(len(points), 1)
+    return cost

@@ -1,0 +1,56 @@
+"""The slot between threads: newest wins, drops are counted, closing wakes everyone."""
+
+from __future__ import annotations
+
+import threading
+
+import pytest
+
+from common.runtime.latest_value import Closed, LatestValue
+
+
+def test_the_newest_value_wins_and_the_others_are_counted() -> None:
+    slot: LatestValue[int] = LatestValue()
+    for value in (1, 2, 3):
+        slot.put(value)
+    assert slot.wait(0) == 3
+    assert slot.dropped == 2
+
+
+def test_a_value_is_taken_once() -> None:
+    slot: LatestValue[int | None] = LatestValue()
+    slot.put(None)
+    assert slot.wait(0) is None
+    with pytest.raises(TimeoutError):
+        slot.wait(0)
+    assert slot.dropped == 0
+
+
+def test_a_waiting_thread_gets_the_value() -> None:
+    slot: LatestValue[str] = LatestValue()
+    got: list[str] = []
+    thread = threading.Thread(target=lambda: got.append(slot.wait(5)))
+    thread.start()
+    slot.put("here")
+    thread.join(5)
+    assert got == ["here"]
+
+
+def test_closing_wakes_a_waiting_thread_and_refuses_later_values() -> None:
+    slot: LatestValue[int] = LatestValue()
+    ended = threading.Event()
+
+    def wait() -> None:
+        with pytest.raises(Closed):
+            slot.wait(5)
+        ended.set()
+
+    thread = threading.Thread(target=wait)
+    thread.start()
+    slot.close()
+    thread.join(5)
+    assert ended.is_set()
+    slot.put(1)
+    with pytest.raises(Closed):
+        slot.wait(0)
+    assert slot.dropped == 0
