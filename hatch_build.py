@@ -22,7 +22,7 @@ class PageBuildHook(BuildHookInterface):  # type: ignore[type-arg]
     """Called by hatchling for each wheel, editable ones included."""
 
     def initialize(self, version: str, build_data: dict[str, Any]) -> None:
-        """Leaves the built page in ``web/dist`` and names it as part of the package, which git-ignored files are not."""
+        """Leaves the built page in ``web/dist`` and names it as part of the package: git-ignored files are not."""
         web = Path(self.root) / WEB
         self.app.display_info("telepose: building the page")
         _install_packages(web)

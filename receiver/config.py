@@ -6,9 +6,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
-from common.transport.zenoh_session import LinkSettings
-
 from common.runtime.metrics import MetricsSettings
+from common.transport.zenoh_session import LinkSettings
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,7 +50,7 @@ class ReceiverSettings:
     name: str | None = None
     stats_file: Path | None = None
     shown_log: Path | None = None
-    link: LinkSettings = field(default_factory=lambda: LinkSettings(connect=("tcp/127.0.0.1:7447",)))
+    link: LinkSettings = field(default_factory=LinkSettings)
     repository: RepositorySettings = field(default_factory=RepositorySettings)
     view: ViewSettings = field(default_factory=ViewSettings)
     http: MetricsSettings = field(default_factory=lambda: MetricsSettings(port=8080))

@@ -55,9 +55,6 @@ def parse_arguments() -> argparse.Namespace:
     parser.add_argument("--seconds", type=float, default=None, metavar="N", help="stop after N seconds")
     parser.add_argument("--report", type=Path, metavar="FILE", help="measure the run and write the figures as JSON")
     parser.add_argument("--body", default="builtin", metavar="NAME", help="builtin, or a body of --data")
-    parser.add_argument(
-        "--body", dest="performer", default=argparse.SUPPRESS, metavar="NAME", help="same as --performer"
-    )
     parser.add_argument("--motion", metavar="ID", help="a motion clip of --data (default: the built-in choreography)")
     parser.add_argument("--data", type=Path, metavar="DIR", help="folder with bodies/ and mocap/")
     parser.add_argument("--recording", type=Path, metavar="DIR", help="play a recording instead of the virtual rig")

@@ -6,9 +6,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
-from common.transport.zenoh_session import LinkSettings
-
 from common.runtime.metrics import MetricsSettings
+from common.transport.zenoh_session import LinkSettings
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,7 +86,7 @@ class SenderSettings:
     person: int = 0
     state_folder: Path | None = None
     stats_file: Path | None = None
-    link: LinkSettings = field(default_factory=lambda: LinkSettings(listen=("tcp/127.0.0.1:7447",)))
+    link: LinkSettings = field(default_factory=LinkSettings)
     capture: CaptureSettings = field(default_factory=CaptureSettings)
     tracking: TrackingSettings = field(default_factory=TrackingSettings)
     poses: CandidateSettings = field(default_factory=CandidateSettings)

@@ -5,19 +5,24 @@ The two paths are DISPOSE Fig. 1: ``SkeletonPath`` runs for every frame and neve
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
+from common.body.rigged_mesh import build_rigged_mesh
 from common.body.skeleton import Skeleton
-from common.body.skeleton_pose import SkeletonPose
+from common.body.skeleton_pose import SkeletonPose, forward_kinematics
 from common.body.view import View
-from common.geometry.camera_model import Camera
 from common.runtime.stage_timer import StageTimer
 from common.wire.body_message import BodyMessage, encode_body, quantized_skeleton
+from common.wire.candidate_pose import CandidatePose, decode_candidate_pose, encode_candidate_pose
 from common.wire.skeleton_packet import SkeletonPacket, encode_skeleton, quantized_pose
+from sender.candidate_poses.usable_pose_set import UsablePoseSet, UsablePoseSettings
 from sender.capture.frame_set import FrameSet
+from sender.config import CandidateSettings
 from sender.fitting.tracker import FitResult, Tracker
 from sender.reconstruction.background import BackgroundModel
 from sender.reconstruction.foreground_points import PointSampler
@@ -36,7 +41,8 @@ class StreamIdentity:
 @dataclass(frozen=True, slots=True, eq=False)
 class TrackedFrame:
     """One frame set after the fast path. ``packet`` is None while nobody has been found. ``body``: a new body message
-    to publish before the packet. ``skeleton``, ``pose``: as the receiver will decode them."""
+    to publish before the packet. ``skeleton``, ``pose``: as the receiver will decode them; ``T_world_link`` (L, 4, 4):
+    their forward kinematics."""
 
     capture_ns: int
     views: tuple[View, ...]
@@ -45,6 +51,7 @@ class TrackedFrame:
     body: bytes | None = None
     skeleton: Skeleton | None = None
     pose: SkeletonPose | None = None
+    T_world_link: NDArray[np.float32] | None = None
 
 
 class SkeletonPath:
@@ -53,7 +60,6 @@ class SkeletonPath:
     def __init__(
         self,
         identity: StreamIdentity,
-        cameras: Sequence[Camera],
         backgrounds: Sequence[BackgroundModel],
         sampler: PointSampler,
         tracker: Tracker,
@@ -61,7 +67,6 @@ class SkeletonPath:
         timer: StageTimer,
     ) -> None:
         self._identity = identity
-        self._cameras = cameras
         self._backgrounds = backgrounds
         self._sampler = sampler
         self._tracker = tracker
@@ -109,7 +114,7 @@ class SkeletonPath:
         )
         self._sequence += 1
         self._previous = (capture_ns, fit.pose)
-        return TrackedFrame(capture_ns, views, fit, packet, message, body, pose)
+        return TrackedFrame(capture_ns, views, fit, packet, message, body, pose, forward_kinematics(body, pose))
 
     def _current_body(self, found: Skeleton) -> tuple[Skeleton, bytes | None]:
         """The body the receiver holds, and the message that tells it when it changed."""
@@ -120,6 +125,82 @@ class SkeletonPath:
         identity = self._identity
         message = BodyMessage(identity.person, identity.epoch, self._revision, self._body, self._frame_rate_hz)
         return self._body, encode_body(message)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Candidates:
+    """What one captured frame changed: the new pose as sent, its χ, and χ and retained flags of the usable pose set."""
+
+    pose_id: int
+    encoded: bytes
+    capture_ns: int
+    chi: dict[int, float]
+    retained: frozenset[int]
+
+
+class CandidatePath:
+    """Some frames: views → rigged mesh → usable pose set and rigging quotients. ``process`` is one thread's own;
+    ``remember`` and ``note_sent`` may be called from another."""
+
+    def __init__(self, identity: StreamIdentity, settings: CandidateSettings, timer: StageTimer) -> None:
+        self._identity = identity
+        self._settings = settings
+        self._timer = timer
+        self._usable = UsablePoseSet()
+        self._poses = 0
+        self._skeletons: deque[tuple[int, NDArray[np.float32]]] = deque(maxlen=UsablePoseSettings().max_skeletons)
+        self._sent: deque[tuple[int, float]] = deque(maxlen=UsablePoseSettings().max_poses)
+
+    def may_become_one(self, tracked: TrackedFrame) -> bool:
+        """Whether a frame is fit to become a candidate pose: somebody is seen, and the skeleton is not doubtful."""
+        fit = tracked.fit
+        return bool(tracked.views) and fit is not None and fit.confidence >= self._settings.least_confidence
+
+    def remember(self, tracked: TrackedFrame) -> None:
+        """A skeleton was sent: candidate poses are judged by how many of those they animate."""
+        if tracked.T_world_link is not None:
+            self._skeletons.append((tracked.capture_ns, tracked.T_world_link))
+
+    def note_sent(self, pose_id: int, retain_threshold: float) -> None:
+        """A pose went out to a receiver, when RT was ``retain_threshold``."""
+        self._sent.append((pose_id, retain_threshold))
+
+    def process(self, tracked: TrackedFrame) -> Candidates:
+        """Make a candidate pose of a frame that may become one.
+
+        The mesh is built from the encoded views, as the receiver will build it, so both ends judge the same one.
+        """
+        with self._timer.stage("encode views"):
+            encoded = self._encode(tracked)
+        with self._timer.stage("candidate mesh"):
+            candidate = decode_candidate_pose(encoded)
+            mesh = build_rigged_mesh(
+                candidate.pose_id, candidate.capture_ns, candidate.skeleton, candidate.pose, candidate.views
+            )
+        with self._timer.stage("usable poses"):
+            while self._sent:
+                self._usable.sent(*self._sent.popleft())
+            while self._skeletons:
+                self._usable.add_skeleton(*self._skeletons.popleft())
+            self._usable.add_pose(mesh)
+            chi, retained = self._usable.quotients(), self._usable.retained()
+        return Candidates(candidate.pose_id, encoded, candidate.capture_ns, chi, retained)
+
+    def _encode(self, tracked: TrackedFrame) -> bytes:
+        assert tracked.skeleton is not None
+        assert tracked.pose is not None
+        identity, settings = self._identity, self._settings
+        self._poses += 1
+        candidate = CandidatePose(
+            pose_id=self._poses,
+            person=identity.person,
+            epoch=identity.epoch,
+            capture_ns=tracked.capture_ns,
+            skeleton=tracked.skeleton,
+            pose=tracked.pose,
+            views=tracked.views,
+        )
+        return encode_candidate_pose(candidate, settings.jpeg_quality, settings.depth_step_mm)
 
 
 def _largest_change_m(a: Skeleton, b: Skeleton) -> float:

@@ -74,11 +74,9 @@ class Page:
             await asyncio.sleep(0.1)
         return value
 
-    async def photograph(self, file: Path | None = None) -> NDArray[np.uint8]:
+    async def photograph(self) -> NDArray[np.uint8]:
         """What a person sees, (H, W, 3) uint8 RGB."""
         png = base64.b64decode((await self.call("Page.captureScreenshot", format="png"))["data"])
-        if file is not None:
-            file.write_bytes(png)
         image = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR_RGB)
         assert image is not None
         return np.asarray(image, np.uint8)

@@ -21,7 +21,9 @@ async def stop(task: asyncio.Task[None]) -> None:
 
 async def test_results_are_delivered_on_the_loop() -> None:
     arrived: asyncio.Queue[tuple[int, int]] = asyncio.Queue()
-    worker = ComputeWorker("w", lambda x: x * x, lambda y: arrived.put_nowait((y, threading.get_ident())))
+    worker: ComputeWorker[int, int] = ComputeWorker(
+        "w", lambda x: x * x, lambda y: arrived.put_nowait((y, threading.get_ident()))
+    )
     task = asyncio.create_task(worker.run())
     worker.submit(3)
     assert await asyncio.wait_for(arrived.get(), 5) == (9, threading.get_ident())
@@ -111,10 +113,14 @@ async def test_a_failing_warm_up_ends_whoever_waits_in_the_same_group() -> None:
         raise ImportError("no kernels")
 
     worker: ComputeWorker[int, int] = ComputeWorker("w", int, lambda _: None, warm_up)
-    with pytest.raises(BaseExceptionGroup) as caught:
+
+    async def owner() -> None:
         async with asyncio.TaskGroup() as group:
             group.create_task(worker.run())
             group.create_task(worker.wait_ready())
+
+    with pytest.raises(BaseExceptionGroup) as caught:
+        await owner()
     assert caught.group_contains(ImportError, match="no kernels")
 
 

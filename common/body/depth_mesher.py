@@ -17,46 +17,47 @@ from common.geometry.rigid_transform import transform_points
 from common.geometry.triangle_mesh import TriangleMesh
 
 SMOOTHING_RADIUS_PIXELS = 2
-SMOOTHING_RANGE_MM = 30.0  # depths further apart belong to different surfaces
-BORDER_SHIFT_PIXELS = 0.5  # a pixel is an area: the outline runs along its rim, not through its centre
+SMOOTHING_RANGE_MM = 50.0  # depths further apart belong to different surfaces; a sensor's steps are smaller
 
 
 def mesh_view(view: View, stride: int = 1) -> TriangleMesh:
     """Mesh one view's foreground, ``stride`` pixels between neighbouring vertices; colours are the pixels'.
 
-    Vertices (V, 3) float32 [m, world], V = foreground pixels on the stride grid; triangles face the camera. V and F
-    are 0 for an empty view. Depth is smoothed within surfaces only; no foreground pixel is lost.
+    Vertices (V, 3) float32 [m, world], V = foreground pixels on the stride grid, row by row; triangles face the
+    camera. V and F are 0 for an empty view. Depth is smoothed within surfaces; no foreground pixel is lost.
 
     Raises:
         ValueError: a stride below 1.
     """
     if stride < 1:
         raise ValueError(f"stride {stride} is below 1")
-    depth = smooth_depth(view.depth_mm, SMOOTHING_RADIUS_PIXELS, SMOOTHING_RANGE_MM)
-    pixels, index = _grid_vertices(depth, stride, BORDER_SHIFT_PIXELS)
-    rows, columns = np.nonzero(index >= 0)
-    faces = _grid_faces(depth, index, stride)
-    rays = _rays(view.camera, pixels + np.array([view.u0, view.v0], np.float32))
-    points = rays * (depth[rows * stride, columns * stride, None] * np.float32(1e-3))
-    colours = np.ascontiguousarray(view.colour[rows * stride, columns * stride])
-    return TriangleMesh(transform_points(view.camera.T_world_camera, points), faces, colours)
+    depth = smooth_depth(view.depth_mm, SMOOTHING_RADIUS_PIXELS, SMOOTHING_RANGE_MM)[::stride, ::stride]
+    index, pixels, depths_m, colours = _grid_vertices(depth, view.colour[::stride, ::stride])
+    rays = _rays(view.camera, pixels * np.float32(stride) + np.array([view.u0, view.v0], np.float32))
+    vertices = transform_points(view.camera.T_world_camera, rays * depths_m[:, None])
+    return TriangleMesh(vertices, _grid_faces(depth, index), colours)
 
 
 def smooth_depth(depth_mm: NDArray[np.uint16], radius: int, range_mm: float) -> NDArray[np.float32]:
-    """Mean (h, w) float32 [mm] of the pixels within ``radius`` whose depth is within ``range_mm``; 0 stays 0.
+    """Depth (h, w) float32 [mm], 0 stays 0: mean of each pixel and the opposite pairs of neighbours within ``radius``.
 
-    Lee's sigma filter: the two box weights of a bilateral filter. It averages noise away without joining
-    surfaces, and the mask keeps its outline.
+    A bilateral filter with box weights: both ends of a pair count if their depths, and their mean, are within
+    ``range_mm`` of the pixel's. Pairs leave slopes where they are, also beside an outline, where a one-sided mean
+    would pull the surface towards the camera; the mask is not eroded.
     """
     return _smooth(depth_mm, radius, np.float32(range_mm))
 
 
 def _rays(camera: Camera, pixels: NDArray[np.float32]) -> NDArray[np.float32]:
     """Viewing rays (V, 3) float32, camera frame, z = 1, of pixels (V, 2)."""
-    if len(pixels) == 0:
-        return np.zeros((0, 3), np.float32)
-    xy = cv2.undistortPoints(pixels.reshape(-1, 1, 2), camera.matrix, camera.distortion if camera.distortion.any() else None)
-    return np.concatenate([xy.reshape(-1, 2), np.ones((len(pixels), 1), np.float32)], axis=1)
+    rays = np.ones((len(pixels), 3), np.float32)
+    if camera.distortion.any() and len(pixels):
+        undistorted = cv2.undistortPoints(pixels.reshape(-1, 1, 2), camera.matrix, camera.distortion)
+        rays[:, :2] = undistorted.reshape(-1, 2)
+    else:
+        centre, focal = np.array([camera.cx, camera.cy]), np.array([camera.fx, camera.fy])
+        rays[:, :2] = (pixels - centre) / focal
+    return rays
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
@@ -64,47 +65,48 @@ def _smooth(depth_mm, radius, range_mm):  # type: ignore[no-untyped-def]
     h, w = depth_mm.shape
     out = np.zeros((h, w), np.float32)
     for y in range(h):
+        rows = min(radius, y, h - 1 - y)
         for x in range(w):
             centre = np.float32(depth_mm[y, x])
             if centre == 0:
                 continue
-            total, count = np.float32(0.0), np.float32(0.0)
-            for j in range(max(0, y - radius), min(h, y + radius + 1)):
-                for i in range(max(0, x - radius), min(w, x + radius + 1)):
-                    d = np.float32(depth_mm[j, i])
-                    near = np.float32(abs(d - centre) <= range_mm)  # the background, 0, is never near
-                    total += near * d
-                    count += near
+            columns = min(radius, x, w - 1 - x)
+            total, count = centre, np.float32(1.0)
+            for j in range(rows + 1):
+                for i in range(-columns if j > 0 else 1, columns + 1):
+                    a, b = np.float32(depth_mm[y - j, x - i]), np.float32(depth_mm[y + j, x + i])
+                    near = max(abs(a - centre), abs(b - centre), abs(a + b - 2 * centre)) <= range_mm
+                    if near and a > 0 and b > 0:
+                        total += a + b
+                        count += np.float32(2.0)
             out[y, x] = total / count
     return out
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
-def _grid_vertices(depth, stride, shift):  # type: ignore[no-untyped-def]
-    """Pixel positions (V, 2) of the vertices, outline pixels moved outwards, and their grid of indices (-1 = none)."""
-    h, w = depth.shape
-    rows, columns = (h + stride - 1) // stride, (w + stride - 1) // stride
+def _grid_vertices(depth, colour):  # type: ignore[no-untyped-def]
+    """Grid of vertex numbers (-1 = none), and of each vertex its grid column and row, depth [m] and colour."""
+    rows, columns = depth.shape
     index = np.full((rows, columns), -1, np.int32)
     pixels = np.empty((rows * columns, 2), np.float32)
+    depths_m = np.empty(rows * columns, np.float32)
+    colours = np.empty((rows * columns, 3), np.uint8)
     count = 0
     for r in range(rows):
         for c in range(columns):
-            y, x = r * stride, c * stride
-            if depth[y, x] == 0:
+            if depth[r, c] == 0:
                 continue
-            left = x > 0 and depth[y, x - 1] > 0
-            right = x + 1 < w and depth[y, x + 1] > 0
-            up = y > 0 and depth[y - 1, x] > 0
-            down = y + 1 < h and depth[y + 1, x] > 0
-            pixels[count, 0] = x + shift * (np.float32(left) - np.float32(right))
-            pixels[count, 1] = y + shift * (np.float32(up) - np.float32(down))
+            pixels[count, 0], pixels[count, 1] = c, r
+            depths_m[count] = depth[r, c] * np.float32(1e-3)
+            for k in range(3):
+                colours[count, k] = colour[r, c, k]
             index[r, c] = count
             count += 1
-    return pixels[:count].copy(), index
+    return index, pixels[:count].copy(), depths_m[:count].copy(), colours[:count].copy()
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
-def _grid_faces(depth, index, stride):  # type: ignore[no-untyped-def]
+def _grid_faces(depth, index):  # type: ignore[no-untyped-def]
     """Triangles (F, 3) of each 2×2 cell with three or four vertices; four are cut along the flatter diagonal."""
     rows, columns = index.shape
     faces = np.empty((2 * rows * columns, 3), np.int32)
@@ -116,9 +118,8 @@ def _grid_faces(depth, index, stride):  # type: ignore[no-untyped-def]
             present = (a >= 0) + (b >= 0) + (d >= 0) + (e >= 0)
             if present < 3:
                 continue
-            y, x = r * stride, c * stride
-            falling = abs(depth[y, x] - depth[y + stride, x + stride])
-            rising = abs(depth[y, x + stride] - depth[y + stride, x])
+            falling = abs(depth[r, c] - depth[r + 1, c + 1])
+            rising = abs(depth[r, c + 1] - depth[r + 1, c])
             if b < 0 or d < 0 or (present == 4 and falling <= rising):  # cut a–e: drop b's or d's triangle if absent
                 if d >= 0:
                     faces[count, 0], faces[count, 1], faces[count, 2] = a, d, e

@@ -10,7 +10,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from common.body.rigged_mesh import RiggedMesh
+from common.body.rigged_mesh import JointEdges, RiggedMesh
 from common.body.skeleton import LINK_INDEX, LINK_NAMES, SIDES
 
 START_THRESHOLD = 0.15  # DISPOSE §7.1; its edges are coarser than ours, so the session corrects it at once
@@ -27,26 +27,23 @@ def default_region_weights() -> NDArray[np.float32]:
     return weights
 
 
-def distortion_score(
-    mesh: RiggedMesh, T_world_link: NDArray[np.float32], region_weights: NDArray[np.float32]
-) -> float:
+def distortion_score(mesh: RiggedMesh, T_world_link: NDArray[np.float32], region_weights: NDArray[np.float32]) -> float:
     """σ of showing ``mesh`` with the links at ``T_world_link`` (L, 4, 4); 0 for its own skeleton.
 
     Not commutative: what is hidden in this mesh stretches when it appears, not the other way round.
     """
-    return float(distortion_scores(mesh, T_world_link[None], region_weights)[0])
+    return float(distortion_scores(mesh.joint_edges, T_world_link[None], region_weights)[0])
 
 
 def distortion_scores(
-    mesh: RiggedMesh, T_world_links: NDArray[np.float32], region_weights: NDArray[np.float32]
+    edges: JointEdges, T_world_links: NDArray[np.float32], region_weights: NDArray[np.float32]
 ) -> NDArray[np.float32]:
-    """σ (N,) float32 of one mesh for N skeletons' links (N, L, 4, 4), with ω ``region_weights`` (L,).
+    """σ (N,) float32 of one mesh's ``edges`` for N skeletons' links (N, L, 4, 4), with ω ``region_weights`` (L,).
 
     Eq. (1): σ_r = Σ|Δlen(e)| / Σ len(e) over the edges joining region r to others, an edge counting in both its
     regions. Eq. (2): σ = (1/m) Σ ω_r σ_r over the m regions that have such edges. A mesh without a single one cannot
     be judged: its σ is infinite.
     """
-    edges = mesh.joint_edges
     if len(edges) == 0:
         return np.full(len(T_world_links), np.inf, np.float32)
     return _scores(
@@ -95,7 +92,9 @@ def _scores(points, rest, pair_links, pair_starts, region_lengths, omega, T):  #
                 for k in range(3):
                     t[i] += T[n, a, k, i] * (T[n, b, k, 3] - T[n, a, k, 3])
                 for j in range(3):
-                    R[i, j] = T[n, a, 0, i] * T[n, b, 0, j] + T[n, a, 1, i] * T[n, b, 1, j] + T[n, a, 2, i] * T[n, b, 2, j]
+                    R[i, j] = (
+                        T[n, a, 0, i] * T[n, b, 0, j] + T[n, a, 1, i] * T[n, b, 1, j] + T[n, a, 2, i] * T[n, b, 2, j]
+                    )
             change = _length_change(points, rest, pair_starts[p], pair_starts[p + 1], R, t)
             out[n] += change * (omega[a] / region_lengths[a] + omega[b] / region_lengths[b]) / regions
     return out
@@ -104,13 +103,13 @@ def _scores(points, rest, pair_links, pair_starts, region_lengths, omega, T):  #
 @njit(nogil=True, cache=True, error_model="numpy", fastmath={"reassoc", "contract", "nsz"})
 def _length_change(points, rest, start, end, R, t):  # type: ignore[no-untyped-def]
     """Σ|Δlen(e)| [m] over the edges start:end of one pair of links, the second at (R, t) in the first's frame."""
-    r00, r01, r02, r10, r11, r12, r20, r21, r22 = R.ravel()
-    t0, t1, t2 = t
+    ax, ay, az = points[0, start:end], points[1, start:end], points[2, start:end]
+    bx, by, bz = points[3, start:end], points[4, start:end], points[5, start:end]
+    lengths = rest[start:end]
     total = np.float32(0.0)
-    for e in range(start, end):
-        bx, by, bz = points[3, e], points[4, e], points[5, e]
-        x = r00 * bx + r01 * by + r02 * bz + t0 - points[0, e]
-        y = r10 * bx + r11 * by + r12 * bz + t1 - points[1, e]
-        z = r20 * bx + r21 * by + r22 * bz + t2 - points[2, e]
-        total += abs(np.sqrt(x * x + y * y + z * z) - rest[e])
+    for e in range(len(lengths)):
+        x = R[0, 0] * bx[e] + R[0, 1] * by[e] + R[0, 2] * bz[e] + t[0] - ax[e]
+        y = R[1, 0] * bx[e] + R[1, 1] * by[e] + R[1, 2] * bz[e] + t[1] - ay[e]
+        z = R[2, 0] * bx[e] + R[2, 1] * by[e] + R[2, 2] * bz[e] + t[2] - az[e]
+        total += abs(np.sqrt(x * x + y * y + z * z) - lengths[e])
     return total

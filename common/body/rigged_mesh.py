@@ -14,13 +14,28 @@ from numpy.typing import NDArray
 
 from common.body.depth_mesher import mesh_view
 from common.body.link_segmentation import nearest_link
-from common.body.skeleton import LINK_COUNT, Skeleton
+from common.body.skeleton import LINK_COUNT, LINK_PARENTS, Skeleton
 from common.body.skeleton_pose import SkeletonPose, forward_kinematics
 from common.body.view import View
 from common.geometry.rigid_transform import inverse
 from common.geometry.triangle_mesh import TriangleMesh
 
-DRAWN_EDGE_M = 0.06  # longer edges bridge an occlusion: they count in σ, drawn they hang like a skirt
+# Triangles that count in σ but are not drawn: longer edges bridge an occlusion and hang like a skirt; links further
+# apart in the tree only touch (a hand at the thigh), and a web spans between them when they part.
+DRAWN_EDGE_M = 0.06
+DRAWN_LINK_STEPS = 2
+
+
+def _link_steps() -> NDArray[np.int64]:
+    """Steps between any two links in the tree (L, L)."""
+    steps = np.full((LINK_COUNT, LINK_COUNT), LINK_COUNT)
+    np.fill_diagonal(steps, 0)
+    for link, parent in enumerate(LINK_PARENTS[1:], start=1):  # parents come first: their rows are complete
+        steps[link, :link] = steps[:link, link] = steps[parent, :link] + 1
+    return steps
+
+
+_LINK_STEPS = _link_steps()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -50,8 +65,8 @@ class RiggedMesh:
     """A captured person, ready to be moved.
 
     ``T_link_world`` (L, 4, 4) float64: world at capture → link frames. ``vertex_link`` (V,) uint8.
-    ``mesh.faces`` holds every triangle; ``faces_drawn`` (F', 3) int32 its first F', none of whose edges was longer
-    than 6 cm at capture. The views stay separate surfaces in the one mesh.
+    ``mesh.faces`` holds every triangle; ``faces_drawn`` (F', 3) int32 are its first F', whose edges were at most 6 cm
+    at capture and join links at most two steps apart. The views stay separate surfaces in the one mesh.
     """
 
     pose_id: int
@@ -68,7 +83,14 @@ class RiggedMesh:
     def nbytes(self) -> int:
         """Memory of the arrays [bytes]."""
         edges = self.joint_edges
-        arrays = (self.mesh.vertices, self.mesh.faces, self.mesh.colours, self.vertex_link, edges.vertices, edges.points)
+        arrays = (
+            self.mesh.vertices,
+            self.mesh.faces,
+            self.mesh.colours,
+            self.vertex_link,
+            edges.vertices,
+            edges.points,
+        )
         return sum(a.nbytes for a in arrays)
 
 
@@ -80,21 +102,20 @@ def build_rigged_mesh(
     Raises:
         ValueError: the views hold no triangle.
     """
-    mesh, drawn_count = _drawn_first(_merged([mesh_view(view) for view in views]))
+    mesh = _merged([mesh_view(view) for view in views])
     if len(mesh.faces) == 0:
         raise ValueError(f"pose {pose_id}: its {len(views)} views hold no surface")
     T_world_link = forward_kinematics(skeleton, pose)
-    T_link_world = inverse(T_world_link.astype(np.float64))
+    T_link_world = inverse(T_world_link.astype(np.float64)).astype(np.float64)
     vertex_link = nearest_link(mesh.vertices, skeleton, T_world_link)
+    mesh, drawn_count = _drawn_first(mesh, vertex_link)
     edges = joint_edges(mesh, vertex_link, T_link_world)
     return RiggedMesh(
         pose_id, capture_ns, skeleton, pose, T_link_world, mesh, vertex_link, mesh.faces[:drawn_count], edges
     )
 
 
-def joint_edges(
-    mesh: TriangleMesh, vertex_link: NDArray[np.uint8], T_link_world: NDArray[np.float64]
-) -> JointEdges:
+def joint_edges(mesh: TriangleMesh, vertex_link: NDArray[np.uint8], T_link_world: NDArray[np.float64]) -> JointEdges:
     """Collect the edges between links, each once, sorted by link pair.
 
     ``vertex_link`` (V,) uint8, ``T_link_world`` (L, 4, 4): as in ``RiggedMesh``.
@@ -134,24 +155,25 @@ def _merged(meshes: Sequence[TriangleMesh]) -> TriangleMesh:
     )
 
 
-def _drawn_first(mesh: TriangleMesh) -> tuple[TriangleMesh, int]:
+def _drawn_first(mesh: TriangleMesh, vertex_link: NDArray[np.uint8]) -> tuple[TriangleMesh, int]:
     """The mesh with its drawn triangles in front, and their number: what is drawn is then a slice, not a copy."""
-    longest_squared = _longest_edges_squared(mesh.vertices, mesh.faces)
-    drawn = longest_squared <= DRAWN_EDGE_M**2
+    drawn = _drawn(mesh.vertices, mesh.faces, vertex_link, _LINK_STEPS <= DRAWN_LINK_STEPS, np.float32(DRAWN_EDGE_M**2))
     faces = np.concatenate([mesh.faces[drawn], mesh.faces[~drawn]])
     return TriangleMesh(mesh.vertices, faces, mesh.colours), int(np.count_nonzero(drawn))
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
-def _longest_edges_squared(vertices, faces):  # type: ignore[no-untyped-def]
-    out = np.zeros(len(faces), np.float32)
+def _drawn(vertices, faces, vertex_link, linked, longest_squared):  # type: ignore[no-untyped-def]
+    """Mask (F,) of the triangles whose edges are short and join links of one limb."""
+    out = np.ones(len(faces), np.bool_)
     for f in range(len(faces)):
         for k in range(3):
             a, b = faces[f, k], faces[f, (k + 1) % 3]
             x = vertices[a, 0] - vertices[b, 0]
             y = vertices[a, 1] - vertices[b, 1]
             z = vertices[a, 2] - vertices[b, 2]
-            out[f] = max(out[f], x * x + y * y + z * z)
+            if x * x + y * y + z * z > longest_squared or not linked[vertex_link[a], vertex_link[b]]:
+                out[f] = False
     return out
 
 

@@ -32,10 +32,4 @@ def add_daemon_options(parser: argparse.ArgumentParser) -> None:
 def overrides(options: argparse.Namespace) -> dict[str, object]:
     """The settings given on the command line, by dotted key."""
     own = {"config", "ready_file", "log_level"}
-    given = {key: value for key, value in vars(options).items() if key not in own and value is not None}
-    # One end is enough to name: a daemon told to dial does not also listen where its defaults say, and vice versa.
-    if "link.connect" in given:
-        given.setdefault("link.listen", [])
-    if "link.listen" in given:
-        given.setdefault("link.connect", [])
-    return given
+    return {key: value for key, value in vars(options).items() if key not in own and value is not None}

@@ -33,6 +33,7 @@ from common.wire.header import (
 )
 from common.wire.quantization import (
     POSITION_BITS,
+    POSITION_STEP_M,
     ROTATION_BITS,
     BitReader,
     dequantize_positions,
@@ -178,7 +179,8 @@ def _encode_previous(packet: SkeletonPacket, present: SkeletonPose) -> tuple[int
     age = round(packet.previous_age_ns / AGE_STEP_NS)
     if previous is None or not 0 <= age <= 0xFFFF:
         return None
-    displacement = quantize_positions(previous.root_position) - quantize_positions(present.root_position)
+    moved_m = previous.root_position.astype(np.float64) - present.root_position
+    displacement = np.rint(moved_m / POSITION_STEP_M)
     if np.abs(displacement).max() > _DISPLACEMENT_LIMIT:
         return None
     before = quaternion.normalized(previous.rotations.astype(np.float64))

@@ -34,6 +34,8 @@ _NAME_MAX_BYTES = 64
 _SIDE_MAX = 8192
 _ZSTD_LEVEL = 1  # higher levels gain nothing on RVL data
 _BLOCK = 8  # JPEG block, pixels
+_START_OF_FRAME, _START_OF_SCAN = b"\xff\xc0", b"\xff\xda"
+_JPEG_SEGMENTS = {_START_OF_FRAME, _START_OF_SCAN, b"\xff\xe0", b"\xff\xdb", b"\xff\xc4"}  # JFIF, tables
 _FOCAL_RANGE = (1.0, 1e5)  # pixels
 _INTRINSIC_LIMITS = (1e5, 1e5, *[1.001, 1.001, 1.001, 1e3] * 3, *[1e2] * 5)  # cx cy, rows of T [m], distortion
 
@@ -152,8 +154,9 @@ def _encode_colour(view: View, quality: int) -> bytes:
 
 def _decode_colour(data: bytes, height: int, width: int) -> NDArray[np.uint8]:
     """Colour (height, width, 3) uint8 RGB; the size in the JPEG header is checked before it is decoded."""
-    if _jpeg_size(data) != (height, width):
-        raise WireError(f"colour: JPEG of {_jpeg_size(data)} pixels, expected {(height, width)}")
+    size = _jpeg_size(data)
+    if size != (height, width):
+        raise WireError(f"colour: JPEG of {size} pixels, expected {(height, width)}")
     try:
         colour = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION)
     except cv2.error as error:
@@ -164,24 +167,30 @@ def _decode_colour(data: bytes, height: int, width: int) -> NDArray[np.uint8]:
 
 
 def _jpeg_size(data: bytes) -> tuple[int, int]:
-    """(height, width) of a baseline JPEG of three 8-bit components, as our encoder writes them.
+    """(height, width) of a baseline JPEG of three 8-bit components in one scan, as our encoder writes them.
 
-    Other kinds are refused: a progressive image of a few bytes can ask for minutes of decoding.
+    All else is refused: an image of many scans, a few bytes each, could ask for minutes of decoding.
     """
     if data[:2] != b"\xff\xd8" or data[-2:] != b"\xff\xd9":
         raise WireError("colour: not a whole JPEG")
-    position = 2
-    while position + 10 <= len(data):
+    size: tuple[int, int] | None = None
+    position, marker = 2, b""
+    while marker != _START_OF_SCAN:
         marker = data[position : position + 2]
-        if marker == b"\xff\xc0":
+        if marker not in _JPEG_SEGMENTS or position + 10 > len(data):
+            raise WireError(f"colour: JPEG segment 0x{marker.hex()} where our encoder writes none")
+        if marker == _START_OF_FRAME:
             precision, height, width, components = struct.unpack_from(">BHHB", data, position + 4)
             if (precision, components) != (8, 3):
                 raise WireError(f"colour: JPEG of {components} components of {precision} bits")
-            return height, width
-        if marker not in (b"\xff\xe0", b"\xff\xdb", b"\xff\xc4"):  # JFIF, quantisation and Huffman tables
-            raise WireError(f"colour: JPEG segment 0x{marker.hex()} where our encoder writes none")
+            size = height, width
         position += 2 + int.from_bytes(data[position + 2 : position + 4], "big")
-    raise WireError("colour: JPEG without a size")
+    if size is None:
+        raise WireError("colour: JPEG without a size")
+    scan = data[position:-2]
+    if scan.count(b"\xff") != scan.count(b"\xff\x00"):  # in a scan, 0 follows every 255 that is no marker
+        raise WireError("colour: JPEG of more than one scan")
+    return size
 
 
 @njit(nogil=True, cache=True)

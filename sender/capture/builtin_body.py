@@ -10,17 +10,16 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import coo_matrix, diags
 
-from sender.capture.builtin_texture import paint
-from sender.capture.implicit_surface import Solid, Tube, build_solid, polygonise
-from sender.capture.skinned_body import INFLUENCES, PerformerMesh, SkinnedBody
+from sender.capture.builtin_texture import tiled_mesh
+from sender.capture.implicit_surface import Solid, Tube, polygonise
+from sender.capture.skinned_body import INFLUENCES, SkinnedBody
 
 Floats = NDArray[np.float64]
 
 BUILTIN = "builtin"
 _SMOOTHINGS = 14  # rounds of averaging the skin weights with the neighbours'
-_CELL_M = 0.0135
-_FACE_CELL_M = 0.0095
-_CHIN_M = 1.53
+_CELL_M, _TALL_CELL_M, _FINE_CELL_M = 0.016, 0.0205, 0.0115  # limbs are long: coarser along them than around
+_HAND_LOW_M, _HAND_HIGH_M, _CHIN_M, _FACE_M = 0.88, 1.06, 1.53, 0.06  # where hands and face lie at rest
 
 # Joints: name, parent, head, tail [m]; the left side stands for both.
 _CENTRAL = (
@@ -41,7 +40,7 @@ _LEFT = (
     ("LeftForeArm", "LeftArm", (0.369, 1.209, -0.025), (0.547, 1.031, 0.046)),
     ("LeftHand", "LeftForeArm", (0.547, 1.031, 0.046), (0.605, 0.973, 0.069)),
     ("LeftFingerBase", "LeftHand", (0.605, 0.973, 0.069), (0.673, 0.905, 0.096)),
-    ("LThumb", "LeftHand", (0.562, 1.014, 0.072), (0.602, 0.98, 0.13)),
+    ("LThumb", "LeftHand", (0.562, 1.014, 0.072), (0.6, 0.985, 0.144)),
 )
 
 
@@ -65,11 +64,18 @@ _TORSO = (
             (0.52, 0.152, 0.108, 0.100),
             (0.64, 0.166, 0.112, 0.112),
             (0.74, 0.172, 0.108, 0.118),
-            (0.82, 0.164, 0.094, 0.112),
-            (0.90, 0.120, 0.066, 0.092),
-            (0.96, 0.072, 0.048, 0.070),
+            (0.82, 0.158, 0.094, 0.112),
+            (0.90, 0.110, 0.066, 0.092),
+            (0.96, 0.068, 0.048, 0.070),
             (1.0, 0.04, 0.035, 0.045),
         ),
+    ),
+    Tube(
+        "clavicle",
+        (0.03, 1.435, -0.035),
+        (0.185, 1.402, -0.025),
+        (_ball(0, 0.045), _ball(0.3, 0.052), _ball(0.85, 0.056), _ball(1, 0.045)),
+        blend_m=0.05,
     ),
 )
 _HEAD = (
@@ -101,7 +107,9 @@ _HEAD = (
         ((0, 0.006, 0.004, 0.02), (0.5, 0.011, 0.012, 0.02), (0.82, 0.0175, 0.0185, 0.02), (1, 0.008, 0.006, 0.02)),
         blend_m=0.012,
     ),
-    Tube("lips", (0, 1.6, 0.096), (0, 1.574, 0.094), (_ball(0, 0.012, 0.5), _ball(0.5, 0.024, 0.4), _ball(1, 0.01, 0.5))),
+    Tube(
+        "lips", (0, 1.6, 0.096), (0, 1.574, 0.094), (_ball(0, 0.012, 0.5), _ball(0.5, 0.024, 0.4), _ball(1, 0.01, 0.5))
+    ),
     Tube(
         "ear",
         (0.078, 1.692, -0.012),
@@ -146,7 +154,13 @@ _ARM = (
         "forearm",
         (0.355, 1.223, -0.0255),
         (0.547, 1.031, 0.046),
-        (_ball(0, 0.040), _ball(0.25, 0.0435), _ball(0.55, 0.0375), (0.9, 0.0225, 0.028, 0.028), (1, 0.020, 0.027, 0.027)),
+        (
+            _ball(0, 0.040),
+            _ball(0.25, 0.0435),
+            _ball(0.55, 0.0375),
+            (0.9, 0.0225, 0.028, 0.028),
+            (1, 0.020, 0.027, 0.027),
+        ),
         blend_m=0.03,
     ),
     Tube(
@@ -172,8 +186,8 @@ _ARM = (
     Tube(
         "thumb",
         (0.556, 1.018, 0.066),
-        (0.606, 0.977, 0.136),
-        (_ball(0, 0.014), _ball(0.3, 0.0155), _ball(0.7, 0.0130), _ball(0.92, 0.0105), _ball(1, 0.004)),
+        (0.600, 0.985, 0.144),
+        (_ball(0, 0.015), _ball(0.3, 0.0165), _ball(0.7, 0.0145), _ball(0.92, 0.0115), _ball(1, 0.005)),
         blend_m=0.014,
     ),
 )
@@ -187,8 +201,9 @@ _LEG = (
             (0.1, 0.079, 0.085, 0.098),
             (0.25, 0.0855, 0.088, 0.104),
             (0.5, 0.079, 0.085, 0.088),
-            (0.8, 0.065, 0.069, 0.066),
-            (1, 0.059, 0.061, 0.060),
+            (0.8, 0.063, 0.067, 0.064),
+            (0.95, 0.056, 0.060, 0.055),
+            (1, 0.050, 0.052, 0.048),
         ),
     ),
     Tube(
@@ -196,8 +211,9 @@ _LEG = (
         (0.099, 0.505, 0.0115),
         (0.1084, 0.070, -0.0136),
         (
-            (0, 0.0585, 0.061, 0.059),
-            (0.3, 0.0580, 0.050, 0.073),
+            (0, 0.050, 0.052, 0.048),
+            (0.08, 0.0565, 0.056, 0.056),
+            (0.3, 0.0575, 0.050, 0.073),
             (0.6, 0.0510, 0.047, 0.063),
             (0.92, 0.0500, 0.052, 0.060),
             (1, 0.0510, 0.054, 0.061),
@@ -226,6 +242,7 @@ _LEG = (
 )
 _GROUPS = ((0.01, _TORSO), (0.025, _HEAD), (0.05, _ARM), (0.04, _LEG))
 _TUBE_JOINT = {
+    "clavicle": "LeftShoulder",
     "neck": "Neck",
     "head": "Head",
     "nose": "Head",
@@ -240,26 +257,17 @@ _TUBE_JOINT = {
     "thigh": "LeftUpLeg",
     "shin": "LeftLeg",
 }
-TUBE_NAMES = tuple(tube.name for _, group in _GROUPS for tube in group)
 
 
 def builtin_body() -> SkinnedBody:
     """The built-in body at rest: A-pose, soles on y = 0, facing +Z."""
-    solid = build_solid(_GROUPS)
+    solid = Solid(_GROUPS)
     points, quads = polygonise(solid, _grid())
     names, parents, heads, tails = _joints()
     joints, weights = _skin_weights(_rigid_joints(points, solid, names), quads, len(names))
-    texture, uv, colours = paint(points, quads, solid, TUBE_NAMES)
-    corners = np.arange(quads.size, dtype=np.int32).reshape(-1, 4)  # every quad has vertices, and a texture tile, of its own
-    mesh = PerformerMesh(
-        faces=np.concatenate([corners[:, [0, 1, 2]], corners[:, [0, 2, 3]]]),
-        vertex_colours=colours,
-        uv=uv,
-        texture=texture,
-    )
     return SkinnedBody(
         name=BUILTIN,
-        mesh=mesh,
+        mesh=tiled_mesh(points, quads, solid.owner(points[quads].mean(axis=1))),
         joint_names=names,
         parents=parents,
         heads=heads,
@@ -272,10 +280,18 @@ def builtin_body() -> SkinnedBody:
 
 
 def _grid() -> tuple[Floats, Floats, Floats]:
-    """Planes of the grid the surface is found on: finer over the face."""
-    side = np.arange(-54, 55) * _CELL_M
-    height = np.concatenate([np.arange(-0.02, _CHIN_M, _CELL_M), np.arange(_CHIN_M, 1.83, _FACE_CELL_M)])
-    depth = np.concatenate([np.arange(-0.17, 0.06, _CELL_M), np.arange(0.065, 0.26, _FACE_CELL_M)])
+    """Planes of the grid the surface is found on: finer over face and hands."""
+    arm = np.concatenate([np.arange(0, 0.52, _CELL_M), np.arange(0.52, 0.71, _FINE_CELL_M)])
+    height = np.concatenate(
+        [
+            np.arange(-0.02, _HAND_LOW_M, _TALL_CELL_M),
+            np.arange(_HAND_LOW_M, _HAND_HIGH_M, _FINE_CELL_M),
+            np.arange(_HAND_HIGH_M, _CHIN_M, _TALL_CELL_M),
+            np.arange(_CHIN_M, 1.83, _FINE_CELL_M),
+        ]
+    )
+    depth = np.concatenate([np.arange(-0.17, _FACE_M, _CELL_M), np.arange(_FACE_M, 0.26, _FINE_CELL_M)])
+    side = np.concatenate([-arm[:0:-1], arm])
     return side, height, depth
 
 
@@ -302,14 +318,12 @@ def _rigid_joints(points: Floats, solid: Solid, names: tuple[str, ...]) -> NDArr
     """Joint (P,) that would move each point (P, 3) if the body were made of rigid pieces."""
     spine = np.array([head[1] for name, _, head, _ in _CENTRAL if name != "Head"])
     joint = np.clip(np.searchsorted(spine, points[:, 1]) - 1, 0, 3)  # the torso, by height
-    owner = np.array(TUBE_NAMES)[solid.owner(points)]
-    on_shoulder = (owner == "torso") & (np.abs(points[:, 0]) > 0.09) & (points[:, 1] > 1.34)
+    owner = solid.owner(points)
     left = points[:, 0] >= 0
     for tube, name in _TUBE_JOINT.items():
         joint[owner == tube] = names.index(name)
     joint[owner == "shoe"] = names.index("LeftFoot")
     joint[(owner == "shoe") & (points[:, 2] > 0.12)] = names.index("LeftToeBase")
-    joint[on_shoulder] = names.index("LeftShoulder")
     mirror = np.array([names.index(_right(name)) for name in names])
     return np.where(left, joint, mirror[joint])
 

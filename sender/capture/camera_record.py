@@ -39,5 +39,5 @@ def camera_from_record(record: Mapping[str, Any]) -> Camera:
         return Camera(str(record["name"]), *sizes, fx, fy, cx, cy, pose, distortion)
     except KeyError as error:
         raise ValueError(f"camera without {error}") from None
-    except TypeError as error:
-        raise ValueError(f"camera {record.get('name', '?')}: {error}") from None
+    except (TypeError, AttributeError) as error:
+        raise ValueError(f"camera {record!r:.60}: {error}") from None

@@ -57,6 +57,7 @@ class RigRenderer:
         self.cameras = cameras_around(settings.cameras, settings.width, settings.height)
         self._performer = performer
         mesh = performer.mesh
+        self._faces = np.ascontiguousarray(mesh.faces, np.int32)
         textured = mesh.uv is not None and mesh.texture is not None
         self._surface: Surface = (mesh.uv, mesh.texture) if textured else mesh.vertex_colours  # type: ignore[assignment]
         rooms = [room_view(camera) for camera in self.cameras]
@@ -70,19 +71,18 @@ class RigRenderer:
 
     def empty_room(self, camera: int) -> np.ndarray:
         """Averaged readings (H, W) uint16 [mm] of the room without the performer."""
-        return averaged([self._sensors[camera].measure(None) for _ in range(_ROOM_FRAMES)])
+        return averaged([self._sensors[camera].background_reading() for _ in range(_ROOM_FRAMES)])
 
     def view(self, camera: int, time_s: float, depth: np.ndarray, colour: np.ndarray) -> None:
         """Fill ``depth`` (H, W) uint16 [mm] and ``colour`` (H, W, 3) uint8 with camera ``camera`` at ``time_s``."""
         if self._posed[0] != time_s:
             self._posed = time_s, self._performer.surface(time_s)
-        faces = self._performer.mesh.faces
-        crop = render_crop(self._posed[1], faces, self._surface, self.cameras[camera], cull_back=True)
+        crop = render_crop(self._posed[1], self._faces, self._surface, self.cameras[camera], cull_back=True)
         colour[:] = self._room_colours[camera]
         if crop is not None:
             h, w = crop.depth.shape
             part = colour[crop.v0 : crop.v0 + h, crop.u0 : crop.u0 + w]
-            part[:] = cv2.copyTo(crop.colour, (crop.depth > 0).view(np.uint8), np.ascontiguousarray(part))
+            cv2.copyTo(crop.colour, (crop.depth > 0).view(np.uint8), part)
         self._sensors[camera].measure(crop, depth)
 
 
@@ -104,6 +104,7 @@ class Rig:
         self._epoch_ns = 0
         self._next = (1, 0)  # frame number, camera
         self._status_ns = 0
+        self._begun_ns = self._instant_ns = 0  # start of an instant's rendering, and how long the last one took
         self._reader: socket.socket | None = None
 
     def close(self) -> None:
@@ -131,17 +132,26 @@ class Rig:
             return None
         now_ns = time.monotonic_ns()
         number, camera = self._next
-        due_ns = self._capture_ns(number, camera)
-        wait_ns = due_ns - AHEAD * self._period_ns - now_ns
+        wait_ns = self._capture_ns(number, camera) - AHEAD * self._period_ns - now_ns
         if wait_ns > 0:
             return wait_ns / 1e9
-        self._next = (number, camera + 1) if camera + 1 < len(self._skews_ns) else (number + 1, 0)
-        if now_ns > due_ns + self._period_ns:
-            self.counters.skipped += 1
-        else:
-            self._render(number, camera, due_ns)
+        if camera == 0:
+            self._next = number, camera = self._in_time(number, now_ns), 0
+            self._begun_ns = now_ns
+        self._render(number, camera, self._capture_ns(number, camera))
+        self._next = (number, camera + 1)
+        if camera + 1 == len(self._skews_ns):
+            self._next = (number + 1, 0)
+            self._instant_ns = min(time.monotonic_ns() - self._begun_ns, AHEAD * self._period_ns)
         self._report(now_ns)
         return 0.0
+
+    def _in_time(self, number: int, now_ns: int) -> int:
+        """The first frame from ``number`` on that can be ready when due: as cameras do, rather skip than be late."""
+        behind = -(-(now_ns + self._instant_ns - self._capture_ns(number, 0)) // self._period_ns)
+        skipped = max(behind, 0)
+        self.counters.skipped += skipped * len(self._skews_ns)
+        return number + skipped
 
     def _render(self, number: int, camera: int, due_ns: int) -> None:
         with self._ring.writing(camera, number) as (depth, colour):

@@ -4,8 +4,8 @@ A structured-light sensor measures disparity, so its errors are constant in 1/z 
 step are given in 1/m. The defaults add up to a standard deviation of 8 mm at 2.5 m and 2.3 mm at 1.35 m, as measured
 on real Kinect v1 and Orbbec recordings. Noise is correlated over neighbouring pixels, as block matching makes it.
 
-The steady background's disparity is kept, so a frame costs one pass over the image; noise is read from a table made
-once, at a random offset and sign per frame.
+To be cheap, readings of the steady background are made ahead, a few of them, and one is drawn per frame; only the
+person's pixels are measured anew. Noise is read from a table made once, at a random offset and sign per frame.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from common.geometry.rasterizer import Crop
 
+_BACKGROUNDS = 12  # readings of the background made ahead
 _SPARE_ROWS = 128  # random offsets into the tables reach over this many image rows
 
 
@@ -63,6 +64,7 @@ class DepthSensor:
         self._chance = self._random.integers(0, 255, (h + _SPARE_ROWS) * w, np.uint8)  # 255 in the loss map: always
         self._millimetres = _step_table(settings)
         self._steps, self._loss = self._measurable(self._background)
+        self._readings = [self.background_reading() for _ in range(_BACKGROUNDS)]
 
     def measure(self, person: Crop | None, out: NDArray[np.uint16] | None = None) -> NDArray[np.uint16]:
         """One frame (H, W) uint16 [mm], 0 = no reading: the background with ``person`` in front of it."""
@@ -72,14 +74,28 @@ class DepthSensor:
             scene = self._background if person is None else self._behind(person, 0)[0]
             np.rint(scene * 1000, casting="unsafe", out=out)
             return out
-        start, chance_start = self._random.integers(0, _SPARE_ROWS * w, 2)
-        sign = np.float32(self._random.choice([-1.0, 1.0]))
-        tables = self._noise[start : start + h * w], self._chance[chance_start : chance_start + h * w]
-        _sample(self._steps, self._loss, *tables, sign, self._millimetres, (0, 0), out)
+        out[:] = self._readings[self._random.integers(_BACKGROUNDS)]
         if person is not None:
-            scene, (v0, u0) = self._behind(person, 1)
-            _sample(*self._measurable(scene), *tables, sign, self._millimetres, (v0, u0), out)
+            scene, corner = self._behind(person, 1)
+            self._read(*self._measurable(scene), corner, out)
         return out
+
+    def background_reading(self) -> NDArray[np.uint16]:
+        """A fresh frame (H, W) uint16 [mm] of the background alone."""
+        out = np.empty(self._background.shape, np.uint16)
+        if self._settings is None:
+            return self.measure(None, out)
+        self._read(self._steps, self._loss, (0, 0), out)
+        return out
+
+    def _read(
+        self, steps: NDArray[np.float32], loss: NDArray[np.uint8], corner: tuple[int, int], out: NDArray[np.uint16]
+    ) -> None:
+        """Readings of a part of the image whose corner is at pixel (v0, u0), into the image ``out``."""
+        spare = _SPARE_ROWS * out.shape[1]
+        noise, chance = (table[self._random.integers(spare) :] for table in (self._noise, self._chance))
+        sign = np.float32(self._random.choice((-1.0, 1.0)))
+        _sample(steps, loss, noise, chance, sign, self._millimetres, corner, out)
 
     def _behind(self, person: Crop, border: int) -> tuple[NDArray[np.float32], tuple[int, int]]:
         """Depth with the person in front: the whole image, or (border > 0) the crop with a border; and its corner."""

@@ -82,7 +82,8 @@ class SkinnedBody:
 
     def surface(self, T_world_joint: Floats) -> NDArray[np.float32]:
         """Mesh vertices (V, 3) float32 [m, world] of posed joints (J, 3, 4)."""
-        return skin(self, self.points, self.skin_joints, self.skin_weights, T_world_joint)[self.point_of_vertex]
+        moved = skin(self, self.points, self.skin_joints, self.skin_weights, T_world_joint)
+        return np.take(moved, self.point_of_vertex, axis=0)
 
     def foot_points(self) -> NDArray[np.int64]:
         """Indices (K,) of the points that the feet and toes move most."""

@@ -34,7 +34,7 @@ class VirtualRig:
 
     ``epoch_ns``: when the performance started; a frame shows ``time_s = (capture_ns - epoch_ns) / 1e9``.
     ``lost``: frames that were overwritten before they were read. ``status``: the rig's own last report
-    (cpu_s, frames, late, skipped, unannounced).
+    (cpu_s, frames, late, skipped, unannounced). Not thread-safe: close it when no thread is reading any more.
     """
 
     def __init__(self, connection: socket.socket, process: RigProcess | None = None) -> None:
@@ -239,15 +239,11 @@ class RigProcess:
         return lines[-1] if lines else f"exit code {code}"
 
     def close(self) -> None:
-        """End it, by force if it does not listen."""
+        """End it at once: it has nothing to save, and its socket lies in the folder removed here."""
+        self._child.kill()
+        self._child.wait()
         assert self._child.stdin is not None
         self._child.stdin.close()
-        self._child.terminate()
-        try:
-            self._child.wait(1.0)
-        except subprocess.TimeoutExpired:
-            self._child.kill()
-            self._child.wait()
         self._errors.close()
         self._folder.cleanup()
 

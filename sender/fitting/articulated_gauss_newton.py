@@ -25,7 +25,7 @@ class Surface(NamedTuple):
     """The body's points and grids, all links one after the other (L links, M points, C grid cells).
 
     ``points, normals`` (M, 3) float32 [m, link frame]; ``weights`` (M,) float32: how rigidly the point follows its link;
-    ``first_point`` (L,) int64; ``origin`` (L, 3) float32 [m]; ``shape`` (L, 3) int64; ``cell_m`` (L,) float32;
+    ``first_point`` (L,) int64; ``origin`` (L, 3) float32 [m]; ``shape`` (L, 3) int64; ``cells_per_m`` (L,) float32;
     ``first_cell`` (L,) int64; ``nearest`` (C,) int16, see ``closest_point_grid``;
     ``low, high`` (L, 3) float32 [m, link frame]: box around the link's points; low > high when it has none.
     """
@@ -36,7 +36,7 @@ class Surface(NamedTuple):
     first_point: Array
     origin: Array
     shape: Array
-    cell_m: Array
+    cells_per_m: Array
     first_cell: Array
     nearest: Array
     low: Array
@@ -65,7 +65,7 @@ class Schedule(NamedTuple):
 class FitArrays(NamedTuple):
     """``score``: mean robust cost per point, 0 (perfect) .. 1 (no point explained); ``inliers``: share of points
     within ``INLIER_M`` of the surface; ``rms_m`` of those; ``assigned, explained`` (L,) float64: points nearest to each
-    link, and those of them that are inliers; ``owner`` (N,) int16: link of each inlier, -1 otherwise."""
+    link, and those of them that are inliers; ``owner`` (N,) int64: link of each inlier, -1 otherwise."""
 
     pose: PoseState
     score: float
@@ -134,11 +134,12 @@ def _near_links(points: Array, R: Array, t: Array, surface: Surface, gate: float
 
 
 @njit(nogil=True, cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
-def closest_point(
+def _closest_point(
     points: Array, normals: Array, near: Array, n: int, R: Array, t: Array, surface: Surface
 ) -> tuple[int, int, float]:
     """Of point n: link, model point and squared distance [m²] of the closest compatible model point; link -1 when there is none."""
-    best_link, best_point, best = -1, -1, np.inf
+    zero = np.float32(0.0)  # single precision throughout: this is where the time goes
+    best_link, best_point, best = -1, -1, np.float32(np.inf)
     for c in range(near.shape[1]):
         link = int(near[n, c])
         if link < 0:
@@ -147,10 +148,10 @@ def closest_point(
         qx = R[link, 0, 0] * dx + R[link, 1, 0] * dy + R[link, 2, 0] * dz
         qy = R[link, 0, 1] * dx + R[link, 1, 1] * dy + R[link, 2, 1] * dz
         qz = R[link, 0, 2] * dx + R[link, 1, 2] * dy + R[link, 2, 2] * dz
-        d = 0.0  # how far outside the box of the link's points: nothing in it can be closer
-        for i, q in enumerate((qx, qy, qz)):
-            outside = max(surface.low[link, i] - q, q - surface.high[link, i], 0.0)
-            d += outside * outside
+        ux = max(surface.low[link, 0] - qx, qx - surface.high[link, 0], zero)
+        uy = max(surface.low[link, 1] - qy, qy - surface.high[link, 1], zero)
+        uz = max(surface.low[link, 2] - qz, qz - surface.high[link, 2], zero)
+        d = ux * ux + uy * uy + uz * uz  # from the box of the link's points: none of them can be closer
         if d >= best:
             continue
         mx = R[link, 0, 0] * normals[n, 0] + R[link, 1, 0] * normals[n, 1] + R[link, 2, 0] * normals[n, 2]
@@ -164,7 +165,7 @@ def closest_point(
         else:
             side = 4 if mz > 0 else 5
         nx, ny, nz = surface.shape[link, 0], surface.shape[link, 1], surface.shape[link, 2]
-        cell = 1.0 / surface.cell_m[link]
+        cell = surface.cells_per_m[link]
         x = min(max(int((qx - surface.origin[link, 0]) * cell), 0), nx - 1)
         y = min(max(int((qy - surface.origin[link, 1]) * cell), 0), ny - 1)
         z = min(max(int((qz - surface.origin[link, 2]) * cell), 0), nz - 1)
@@ -183,10 +184,28 @@ def closest_point(
 
 
 @njit(nogil=True, cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+def match_points(
+    points: Array, normals: Array, near: Array, R: Array, t: Array, surface: Surface, link: Array, row: Array, d2: Array
+) -> None:
+    """Closest compatible model point of every point (N, 3): fills ``link`` (N,) int64 (-1: none), ``row`` (N,) int64
+    and the squared distance ``d2`` (N,) [m²]; ``R, t``: link frames in the world, from ``forward``."""
+    R32, t32 = R.astype(np.float32), t.astype(np.float32)
+    for n in range(len(points)):
+        link[n], row[n], d2[n] = _closest_point(points, normals, near, n, R32, t32, surface)
+        for c in range(1, near.shape[1]):  # asked first next time: its short distance rules the other boxes out
+            if near[n, c] < 0 or link[n] < 0:
+                break
+            if near[n, c] == link[n]:
+                near[n, 0], near[n, c] = near[n, c], near[n, 0]
+                break
+
+
+@njit(nogil=True, cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
 def _normal_equations(
     points: Array,
-    normals: Array,
-    near: Array,
+    links: Array,
+    rows: Array,
+    squares: Array,
     R: Array,
     t: Array,
     surface: Surface,
@@ -202,7 +221,7 @@ def _normal_equations(
     sigma2 = (0.5 * gate) ** 2
     J = np.empty(6)
     for n in range(len(points)):
-        link, k, d2 = closest_point(points, normals, near, n, R, t, surface)
+        link, k, d2 = links[n], rows[n], squares[n]
         if link < 0 or d2 > gate * gate:
             continue
         m0, m1, m2 = surface.points[k, 0], surface.points[k, 1], surface.points[k, 2]
@@ -476,6 +495,7 @@ def fit_pose(
     H, g = np.empty((links, 6, 6)), np.empty((links, 6))
     A, b = np.empty((size, size)), np.empty(size)
     near = np.empty((len(points), NEAR_LINKS), np.int8)
+    link, row, d2 = np.empty(len(points), np.int64), np.empty(len(points), np.int64), np.empty(len(points))
     scale = 2500.0 / max(len(points), 1) / DATA_SIGMA_M**2
     shrink = (plan.gate_last_m / plan.gate_first_m) ** (1.0 / max(plan.iterations - 1, 1))
     gate = plan.gate_first_m
@@ -483,7 +503,8 @@ def fit_pose(
         R, t = forward(root, local, offsets, table.parents)
         if iteration % 3 == 0:
             _near_links(points, R, t, surface, gate + 0.02, near)
-        _normal_equations(points, normals, near, R, t, surface, gate, plan.point_share, H, g)
+        match_points(points, normals, near, R, t, surface, link, row, d2)
+        _normal_equations(points, link, row, d2, R, t, surface, gate, plan.point_share, H, g)
         _project(H, g, R, t, table, scale, A, b)
         _add_priors(PoseState(root, local), predicted, table, plan, A, b)
         _solve(A, b)
@@ -501,21 +522,22 @@ def judge_pose(
     count = len(points)
     near = np.empty((count, NEAR_LINKS), np.int8)
     _near_links(points, R, t, surface, 0.15, near)
-    owner = np.full(count, -1, np.int16)
+    link, row, d2 = np.empty(count, np.int64), np.empty(count, np.int64), np.empty(count)
+    match_points(points, normals, near, R, t, surface, link, row, d2)
     assigned, explained = np.zeros(len(R)), np.zeros(len(R))
     score, inliers, square = 0.0, 0, 0.0
     for n in range(count):
-        link, _, d2 = closest_point(points, normals, near, n, R, t, surface)
-        if link < 0:
+        if link[n] < 0:
             score += 1.0
             continue
-        score += d2 / (d2 + INLIER_M**2)
-        assigned[link] += 1.0
-        if d2 < INLIER_M**2:
-            explained[link] += 1.0
-            owner[n] = link
+        score += d2[n] / (d2[n] + INLIER_M**2)
+        assigned[link[n]] += 1.0
+        if d2[n] < INLIER_M**2:
+            explained[link[n]] += 1.0
             inliers += 1
-            square += d2
+            square += d2[n]
+        else:
+            link[n] = -1
     share = inliers / count if count else 0.0
     rms = np.sqrt(square / inliers) if inliers else 0.0
-    return FitArrays(state, score / count if count else 1.0, share, rms, assigned, explained, owner)
+    return FitArrays(state, score / count if count else 1.0, share, rms, assigned, explained, link)

@@ -37,14 +37,14 @@ _UNSPLIT = {"fingers": "hand", "toes": "foot"}  # locked joints: their points be
 class BodyModel:
     """Surface points per link, gathered from clouds with known poses.
 
-    ``skeleton``: sizes; ``revision`` counts changes of the surface (``surface()`` is rebuilt when it moved).
+    ``skeleton``: sizes. Adding points does not move the surface at once: ``surface`` brings links up to date.
     """
 
     def __init__(self, skeleton: Skeleton) -> None:
         self.skeleton = skeleton
-        self.revision = 0
         self._cells = [_LinkCells() for _ in range(LINK_COUNT)]
-        self._grids: list[LinkGrid | None] = [None] * LINK_COUNT
+        self._grids: list[tuple[LinkGrid, Array] | None] = [None] * LINK_COUNT
+        self._stale = list(range(LINK_COUNT))  # longest waiting first
         self._surface: Surface | None = None
 
     @property
@@ -71,23 +71,27 @@ class BodyModel:
             points = (cloud.positions[chosen] - T[:3, 3]) @ T[:3, :3]
             normals = cloud.normals[chosen] @ T[:3, :3]
             self._cells[link].add(points, normals, cloud.colours[chosen].astype(np.float64), weights[chosen])
-            self._grids[link] = None
-        self.revision += 1
-        self._surface = None
+            if int(link) not in self._stale:
+                self._stale.append(int(link))
 
     def rescaled(self, skeleton: Skeleton) -> None:
         """Takes new sizes; the surface stays where it is in the links' frames."""
         self.skeleton = skeleton
 
-    def surface(self) -> Surface:
-        """All links' points and closest-point grids; only links that changed are built again."""
-        if self._surface is None:
-            for link, cells in enumerate(self._cells):
-                if self._grids[link] is None:
-                    points, normals, _ = cells.surface()
-                    self._grids[link] = build_link_grid(points, normals, GRID_CELL_M, GRID_MARGIN_M)
-            grids = [grid for grid in self._grids if grid is not None]
-            self._surface = _join(grids, [cells.rigidity() for cells in self._cells])
+    def surface(self, refreshed_links: int = LINK_COUNT) -> Surface:
+        """All links' points and closest-point grids. At most ``refreshed_links`` links whose points changed get a new
+        grid (about 15 ms each), the others answer as before; a link's first grid is always built."""
+        missing = [link for link in self._stale if self._grids[link] is None]
+        waiting = [link for link in self._stale if self._grids[link] is not None]
+        renewed = missing + waiting[: max(refreshed_links - len(missing), 0)]
+        for link in renewed:
+            points, normals, _ = self._cells[link].surface()
+            grid = build_link_grid(points, normals, GRID_CELL_M, GRID_MARGIN_M)
+            self._grids[link] = grid, self._cells[link].rigidity()
+        self._stale = [link for link in self._stale if link not in renewed]
+        if renewed or self._surface is None:
+            ready = [entry for entry in self._grids if entry is not None]
+            self._surface = _join([grid for grid, _ in ready], [rigidity for _, rigidity in ready])
         return self._surface
 
     def to_bytes(self) -> bytes:
@@ -161,8 +165,7 @@ class _LinkCells:
         rows = np.concatenate([points, normals, colours, rigid[:, None], np.ones((len(points), 1))], axis=1)
         keys, inverse = np.unique(np.concatenate([self.keys, _cell_keys(points, normals)]), return_inverse=True)
         sums = np.zeros((len(keys), _COLUMNS))
-        np.add.at(sums, inverse[: len(self.keys)], self.sums)
-        np.add.at(sums, inverse[len(self.keys) :], rows)
+        _add_rows(inverse, np.concatenate([self.sums, rows]), sums)
         sums /= np.maximum(sums[:, _COUNT :_COLUMNS] / MEMORY_FRAMES, 1.0)
         if len(keys) > MAX_POINTS_PER_LINK:  # keep what was seen most often
             kept = np.sort(np.argsort(-sums[:, _COUNT], kind="stable")[:MAX_POINTS_PER_LINK])
@@ -186,6 +189,13 @@ class _LinkCells:
         return self.sums[:, _RIGID] / self.sums[:, _COUNT]
 
 
+@njit(nogil=True, cache=True)  # type: ignore[untyped-decorator]
+def _add_rows(targets: Array, rows: Array, sums: Array) -> None:
+    for n in range(len(targets)):
+        for column in range(rows.shape[1]):
+            sums[targets[n], column] += rows[n, column]
+
+
 def _cell_keys(points: Array, normals: Array) -> Array:
     cell = np.clip(np.floor(points / CELL_M), -(1 << 17), (1 << 17) - 1).astype(np.int64) + (1 << 17)
     axis = np.argmax(np.abs(normals), axis=1)
@@ -207,7 +217,7 @@ def _join(grids: list[LinkGrid], rigidity: list[Array]) -> Surface:
         first_point=np.cumsum(counts) - counts,
         origin=np.stack([grid.origin for grid in grids]),
         shape=np.array([grid.nearest.shape[1:] for grid in grids], np.int64),
-        cell_m=np.array([grid.cell_m for grid in grids], np.float32),
+        cells_per_m=np.array([1.0 / grid.cell_m for grid in grids], np.float32),
         first_cell=np.cumsum(cells) - cells,
         nearest=np.concatenate([grid.nearest.ravel() for grid in grids]),
         low=low,

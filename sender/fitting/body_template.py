@@ -11,7 +11,6 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from common.body.skeleton import LINK_COUNT, LINK_INDEX, LINK_NAMES, LINK_PARENTS, SIDES, Skeleton, human_skeleton
@@ -24,7 +23,7 @@ Cone = tuple[Point, float, Point, float]
 # (name, start, σ of the prior): factors of the tables, except stature [m].
 SIZES = (
     ("stature", 1.70, 0.15),
-    ("trunk_length", 1.0, 0.04),
+    ("trunk_length", 1.0, 0.03),
     ("trunk_breadth", 1.0, 0.12),
     ("trunk_radius", 1.0, 0.12),
     ("neck", 1.0, 0.06),
@@ -35,8 +34,8 @@ SIZES = (
     ("hand", 1.0, 0.06),
     ("arm_radius", 1.0, 0.15),
     ("hip_width", 1.0, 0.06),
-    ("thigh", 1.0, 0.04),
-    ("shin", 1.0, 0.04),
+    ("thigh", 1.0, 0.03),
+    ("shin", 1.0, 0.03),
     ("leg_radius", 1.0, 0.15),
     ("foot", 1.0, 0.06),
 )
@@ -77,51 +76,53 @@ _RADIUS_SIZE = {
     "foot": "foot",
     "toes": "foot",
 }
-# Joints of the trunk where ``human_skeleton`` is only schematic: xiphoid 0.73, cervicale 0.845, atlas 0.905 of stature.
-_TRUNK_JOINTS = {
+# Joints that ``human_skeleton`` places only schematically. Heights over stature: xiphoid 0.74, cervicale 0.845, atlas
+# 0.91, ankle in a shoe 0.05; upper arm of de Leva 1996.
+_JOINTS = {
     "lower_spine": (0.0, 0.055, -0.010),
-    "upper_spine": (0.0, 0.145, -0.010),
-    "neck": (0.0, 0.115, 0.012),
-    "head": (0.0, 0.060, 0.018),
-    "left_clavicle": (0.015, 0.080, 0.018),
-    "right_clavicle": (-0.015, 0.080, 0.018),
-    "left_thigh": (0.056, 0.0, 0.0),
-    "right_thigh": (-0.056, 0.0, 0.0),
+    "upper_spine": (0.0, 0.155, -0.010),
+    "neck": (0.0, 0.105, 0.012),
+    "head": (0.0, 0.065, 0.020),
+    "left_clavicle": (0.015, 0.070, 0.018),
+    "left_forearm": (0.162, 0.0, 0.0),
+    "left_thigh": (0.060, 0.0, 0.0),
+    "left_foot": (0.0, -0.235, 0.0),
 }
-# Cones (start, radius, end, radius) in the link's frame; trunk cones are doubled at ±x, limbs are the left ones.
+_CROWN = (0.0, 0.090, -0.008)  # in the head's frame
 _TRUNK_CONES: dict[str, tuple[Cone, ...]] = {
-    "pelvis": (((0.034, -0.030, 0.006), 0.064, (0.030, 0.055, 0.0), 0.058),),
-    "lower_spine": (((0.030, 0.0, 0.010), 0.058, (0.030, 0.145, 0.010), 0.062),),
-    "upper_spine": (((0.030, 0.0, 0.020), 0.062, (0.034, 0.045, 0.016), 0.060),),
+    "pelvis": (((0.034, -0.025, 0.006), 0.063, (0.030, 0.055, 0.006), 0.058),),
+    "lower_spine": (((0.030, 0.0, 0.016), 0.058, (0.030, 0.155, 0.022), 0.061),),
+    "upper_spine": (((0.030, 0.0, 0.032), 0.061, (0.034, 0.035, 0.024), 0.060),),
 }
 _CENTRAL_CONES: dict[str, tuple[Cone, ...]] = {
     "neck": (((0.0, -0.010, 0.0), 0.038, (0.0, 0.040, 0.012), 0.034),),
     "head": (
-        ((0.0, 0.005, 0.016), 0.036, (0.0, 0.046, 0.006), 0.046),
-        ((0.0, 0.020, -0.012), 0.042, (0.0, 0.046, -0.018), 0.046),
+        ((0.0, 0.000, 0.014), 0.036, (0.0, 0.043, 0.004), 0.047),
+        ((0.0, 0.015, -0.014), 0.042, (0.0, 0.043, -0.020), 0.047),
     ),
 }
 _LEFT_CONES: dict[str, tuple[Cone, ...]] = {
     "clavicle": (((0.0, -0.010, 0.0), 0.045, (0.082, -0.004, 0.0), 0.036),),
-    "upper_arm": (((0.0, 0.0, 0.0), 0.035, (0.168, 0.0, 0.0), 0.026),),
+    "upper_arm": (((0.0, 0.0, 0.0), 0.035, (0.162, 0.0, 0.0), 0.026),),
     "forearm": (((0.0, 0.0, 0.0), 0.027, (0.146, 0.0, 0.0), 0.018),),
     "hand": (((0.0, 0.0, 0.0), 0.018, (0.052, 0.0, 0.0), 0.021),),
     "fingers": (((0.0, 0.0, 0.0), 0.020, (0.042, 0.0, 0.0), 0.012),),
-    "thigh": (((0.004, 0.0, 0.0), 0.055, (0.0, -0.245, 0.004), 0.036),),
+    "thigh": (((-0.006, 0.0, 0.0), 0.055, (0.0, -0.245, 0.004), 0.036),),
     "shin": (
         ((0.0, 0.0, 0.004), 0.036, (0.0, -0.08, -0.008), 0.035),
-        ((0.0, -0.08, -0.008), 0.035, (0.0, -0.240, 0.0), 0.025),
+        ((0.0, -0.08, -0.008), 0.035, (0.0, -0.235, 0.0), 0.026),
     ),
-    "foot": (((0.0, -0.020, -0.026), 0.025, (0.004, -0.026, 0.080), 0.022),),
-    "toes": (((-0.004, 0.004, 0.0), 0.020, (0.004, 0.0, 0.034), 0.016),),
+    "foot": (((0.0, -0.020, -0.022), 0.030, (0.004, -0.028, 0.078), 0.025),),
+    "toes": (((-0.004, 0.002, 0.0), 0.021, (0.004, -0.002, 0.034), 0.018),),
 }
 # Free joint angles of the start pose: (link, axes, σ [rad]); the rest of the tree stays straight.
-_SPINE_JOINTS = (("lower_spine", "xyz", 0.15), ("neck", "xz", 0.25))
+_SPINE_JOINTS = (("lower_spine", "xyz", 0.10), ("neck", "xz", 0.25))
 _LEFT_JOINTS = (
     ("clavicle", "yz", 0.12),
     ("upper_arm", "xyz", 0.6),
     ("forearm", "y", 0.5),
-    ("thigh", "xyz", 0.3),
+    ("thigh", "xz", 0.3),
+    ("thigh", "y", 0.15),
     ("shin", "x", 0.3),
     ("foot", "x", 0.2),
 )
@@ -131,11 +132,11 @@ class Template(NamedTuple):
     """The tables as arrays for the kernels (L links, K cones, D joint angles, S sizes; P = S + 3 + D parameters).
 
     ``offsets`` (L, 3) and ``offset_sizes`` (L, 3) int: joint in the parent's frame and the size that stretches it
-    (-1: none). ``ends`` (K, 2, 3), ``end_sizes`` (K, 3), ``radii`` (K, 2), ``radius_sizes`` (K,), ``cone_links`` (K,).
+    (-1: none). ``ends`` (K, 2, 3), ``end_sizes`` (K, 3), ``radii`` (K, 2), ``radius_sizes``, ``cone_links`` (K,).
     ``angle_links``, ``angle_axes`` (D,): which component of which link's rotation vector each angle is.
     ``prior``, ``sigma`` (P,): start and spread of every parameter. ``tip_cones``: cones that end the body (crown,
-    fingers, toes), ``sole_cones``: those that stand on the floor, ``leg_cones`` (K,): thigh to toes. ``lower_bounded``, ``upper_bounded``: angles in θ
-    that do not turn below or above 0 (knees and elbows).
+    fingers, toes), ``sole_cones``: those that stand on the floor, ``leg_cones`` (K,): thigh to toes.
+    ``lower_bounded``, ``upper_bounded``: angles in θ that do not turn below or above 0 (knees and elbows).
     """
 
     parents: NDArray[np.int64]
@@ -179,8 +180,10 @@ def _cones() -> list[tuple[str, str, Cone]]:
 def human_template() -> Template:
     """The average human: ``human_skeleton``'s joints, the cones above, priors of sizes and angles."""
     offsets = human_skeleton(1.0).offsets.astype(np.float64)
-    for name, offset in _TRUNK_JOINTS.items():
-        offsets[LINK_INDEX[name]] = offset
+    for name, (x, y, z) in _JOINTS.items():
+        offsets[LINK_INDEX[name]] = x, y, z
+        if name.startswith("left_"):
+            offsets[LINK_INDEX[name.replace("left", "right")]] = -x, y, z
     parts = [name.partition("_")[2] if name.partition("_")[0] in SIDES else name for name in LINK_NAMES]
     offset_sizes = []
     for link, part in enumerate(parts):
@@ -190,7 +193,7 @@ def human_template() -> Template:
     joints = [(link, axes, sigma) for link, axes, sigma in _SPINE_JOINTS]
     joints += [(f"{side}_{link}", axes, sigma) for side in SIDES for link, axes, sigma in _LEFT_JOINTS]
     angles = [(LINK_INDEX[link], "xyz".index(axis), sigma) for link, axes, sigma in joints for axis in axes]
-    root = [(0, axis, 0.5) for axis in range(3)]
+    root = [(0, axis, 0.3 if axis == 1 else 0.12) for axis in range(3)]
     angles = root + angles
     cone_names = [link for link, _, _ in cones]
 
@@ -230,58 +233,6 @@ def angle_index(template: Template, link: str, axis: str) -> int:
     return ROOT + 3 + int(np.argmax(match))
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
-def place(  # type: ignore[no-untyped-def]
-          theta, heading, parents, offsets, offset_sizes, ends, end_sizes, radii, radius_sizes, cone_links,
-          angle_links, angle_axes, root, rotations, origins, placed_ends, placed_radii):  # fmt: skip
-    """Forward kinematics of the template with parameters θ: fills the link frames and the cones in the world.
-
-    ``rotations`` (L, 3, 3), ``origins`` (L, 3) [m], ``placed_ends`` (K, 2, 3) [m], ``placed_radii`` (K, 2) [m].
-    ``heading`` [rad]: the root's rotation about y before its own rotation vector; ``root``: where its position is in θ.
-    """
-    stature = theta[0]
-    L = len(parents)
-    vectors = np.zeros((L, 3))
-    for a in range(len(angle_links)):
-        vectors[angle_links[a], angle_axes[a]] = theta[root + 3 + a]
-    for link in range(L):
-        x, y, z = vectors[link]
-        angle = np.sqrt(x * x + y * y + z * z)
-        s = np.sin(angle) / angle if angle > 1e-9 else 1.0
-        c = (1.0 - np.cos(angle)) / (angle * angle) if angle > 1e-9 else 0.5
-        local = np.array([
-            [1 - c * (y * y + z * z), c * x * y - s * z, c * x * z + s * y],
-            [c * x * y + s * z, 1 - c * (x * x + z * z), c * y * z - s * x],
-            [c * x * z - s * y, c * y * z + s * x, 1 - c * (x * x + y * y)],
-        ])  # fmt: skip
-        if link == 0:
-            ch, sh = np.cos(heading), np.sin(heading)
-            turn = np.array([[ch, 0.0, sh], [0.0, 1.0, 0.0], [-sh, 0.0, ch]])
-            rotations[0] = turn @ local
-            origins[0] = theta[root : root + 3]
-            continue
-        parent = parents[link]
-        rotations[link] = rotations[parent] @ local
-        for row in range(3):
-            origins[link, row] = origins[parent, row]
-        for axis in range(3):
-            size = offset_sizes[link, axis]
-            length = offsets[link, axis] * stature * (theta[size] if size >= 0 else 1.0)
-            for row in range(3):
-                origins[link, row] += rotations[parent, row, axis] * length
-    for k in range(len(cone_links)):
-        link = cone_links[k]
-        for end in range(2):
-            placed_radii[k, end] = radii[k, end] * stature * theta[radius_sizes[k]]
-            for row in range(3):
-                placed_ends[k, end, row] = origins[link, row]
-            for axis in range(3):
-                size = end_sizes[k, axis]
-                length = ends[k, end, axis] * stature * (theta[size] if size >= 0 else 1.0)
-                for row in range(3):
-                    placed_ends[k, end, row] += rotations[link, row, axis] * length
-
-
 def template_skeleton(template: Template, theta: NDArray[np.float64]) -> Skeleton:
     """The link tree with the sizes in θ (P,): offsets, tips and radii in metres."""
     factors = np.append(theta[:ROOT], 1.0)  # index -1: no size of its own
@@ -289,6 +240,7 @@ def template_skeleton(template: Template, theta: NDArray[np.float64]) -> Skeleto
     offsets[0] = 0.0
     base = human_skeleton(float(theta[0]))
     tips, radii = base.tips.astype(np.float64), base.radii.astype(np.float64)
+    tips[LINK_INDEX["head"]] = np.array(_CROWN) * theta[0]
     for link in range(LINK_COUNT):
         cone = int(np.argmax(template.cone_links == link))
         tips[link] *= factors[template.end_sizes[cone]]

@@ -17,7 +17,7 @@ Array = NDArray[Any]
 
 NORMAL_BINS = 6
 BIN_COSINE = 0.25  # a point is in every bin whose direction is within 75° of its normal
-MAX_CELLS_PER_AXIS = 96
+MAX_CELLS = 12_000  # of each main direction: large links get coarser cells, which their flat surfaces allow
 
 
 class LinkGrid(NamedTuple):
@@ -44,7 +44,7 @@ def build_link_grid(points: Array, normals: Array, cell_m: float, margin_m: floa
         return LinkGrid(points, normals, np.zeros(3, np.float32), cell_m, np.full((NORMAL_BINS, 1, 1, 1), -1, np.int16))
     origin = (points.min(0) - margin_m).astype(np.float32)
     extent = points.max(0) + margin_m - origin
-    cell_m = max(cell_m, float(extent.max()) / MAX_CELLS_PER_AXIS)
+    cell_m = max(cell_m, float(np.prod(extent) / MAX_CELLS) ** (1 / 3))
     shape = np.maximum(np.ceil(extent / cell_m).astype(np.int64), 1)
     nearest = np.full((NORMAL_BINS, *shape), -1, np.int16)
     _fill_nearest(points, normals, origin, np.float32(cell_m), nearest)

@@ -23,17 +23,23 @@ from sender.fitting.body_template import (
     template_pose,
     template_skeleton,
 )
-from sender.fitting.template_fit import TemplateFit, fit_template
+from sender.fitting.template_fit import TemplateFit, fit_template, unfitted
 
 Floats = NDArray[np.float64]
 
 MINIMUM_POINTS = 200
-COARSE_POINTS, FINE_POINTS = 300, 1200
-COARSE_ITERATIONS, FINE_ITERATIONS = 9, 16
+COARSE_POINTS, COARSE_ITERATIONS, COARSE_GATES_M = 300, 9, (0.20, 0.06)
+FINE_POINTS, FINE_ITERATIONS, FINE_GATES_M = 1200, 16, (0.08, 0.03)
+FINE_FITS = 4
 INLIER_M = 0.035
 LEAST_INLIERS = 0.6
-ARM_ANGLES_RAD = (0.25, 0.8, 1.45)  # between upper arm and trunk: hanging, A-pose, T-pose
-_LEGS = ("thigh", "shin", "foot", "toes")
+POINTS_OF_A_SEEN_LINK = 8.0
+ON_FLOOR_M = 0.3  # a cloud that ends higher above the floor shows no feet
+LEAST_STATURE_M = 1.1  # where the floor is not known, what is lower is taken for an upper body
+AVERAGE_STATURE_M = 1.70
+# Angles to start from: (between upper arm and trunk, elbow): hanging, A-pose, T-pose; hanging, forearms on a table.
+STANDING_ARMS_RAD = ((0.25, 0.3), (0.8, 0.3), (1.45, 0.3))
+SITTING_ARMS_RAD = ((0.25, 0.3), (0.25, 1.3))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -58,24 +64,23 @@ class NoPose:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Outline:
-    """What the cloud says before any fit: heights [m, world], the trunk's middle (x, z), the facings to try [rad],
-    and the direction (x, z) towards the cameras when they all stand on one side (else zeros)."""
+    """What the cloud says before any fit. ``floor_y``, ``stature_m`` [m]; ``middle`` (2,): x, z of the trunk [m];
+    ``headings``: facings to try [rad about y]; ``person`` (N,): points that can belong to the person."""
 
     floor_y: float
     stature_m: float
     whole_body: bool
     middle: Floats
     headings: tuple[float, ...]
-    camera_side: Floats
+    person: NDArray[np.bool_]
 
 
 def find_initial_pose(cloud: PointCloud, floor_y: float | None = None) -> InitialPose | NoPose:
     """Sizes and pose of the one person in ``cloud`` (N points, world, y up), standing in A-pose, T-pose or arms down.
 
     ``floor_y`` [m]: height of the floor, when known; else the lowest points are taken for the soles. Clouds of one
-    camera show one side; a person seen from there is expected to face the camera unless the feet say otherwise.
-    A cloud without legs gives an upper body at average proportions. Several clouds of a person standing still may be
-    joined into one. Costs about 0.3 s.
+    camera, which show one side, will do. A cloud without legs gives an upper body at average proportions, taken to
+    face the camera more or less. Several clouds of a person standing still may be joined into one.
     """
     if len(cloud) < MINIMUM_POINTS:
         return NoPose(f"{len(cloud)} points, at least {MINIMUM_POINTS} are needed")
@@ -84,99 +89,91 @@ def find_initial_pose(cloud: PointCloud, floor_y: float | None = None) -> Initia
     if isinstance(outline, NoPose):
         return outline
     template = human_template()
-    used = np.ones(len(template.cone_links), np.bool_)
-    if not outline.whole_body:
-        used = ~template.leg_cones
-    fit = _best_fit(template, points, normals, outline, used)
-    return _judged(template, fit, outline)
+    fit = _best_fit(template, points[outline.person], normals[outline.person], outline)
+    return _judged(template, fit, outline, len(cloud))
 
 
 def _outline(points: Floats, normals: Floats, floor_y: float | None) -> _Outline | NoPose:
     heights = np.sort(points[:, 1])
     top, bottom = float(heights[-3]), float(heights[2])
-    span = top - bottom
-    if not 0.3 < span < 2.4:
-        return NoPose(f"the cloud is {span:.2f} m high: not one person")
-    mean_normal = normals[:, [0, 2]].mean(axis=0)
+    if not 0.3 < top - bottom < 2.4:
+        return NoPose(f"the cloud is {top - bottom:.2f} m high: not one person")
+    mean_normal = normals[:, [0, 2]].mean(axis=0)  # cancels when cameras stand all around
     length = float(np.linalg.norm(mean_normal))
-    camera_side = mean_normal / length if length > 0.3 else np.zeros(2)  # all around, the normals cancel
-    whole_body = _shows_legs(points, top, span)
-    if whole_body:
-        floor = bottom if floor_y is None else floor_y
-        stature = top - floor
-        if not 0.9 < stature < 2.3:
-            return NoPose(f"standing {stature:.2f} m high: not a person on the floor")
-    else:
-        stature = 1.70
-        floor = top - stature
+    camera_side = mean_normal / length if length > 0.3 else np.zeros(2)
+    on_floor = bottom - floor_y < ON_FLOOR_M if floor_y is not None else top - bottom > LEAST_STATURE_M
+    if not on_floor:
+        return _upper_body_outline(points, normals, top, camera_side)
+    floor = bottom if floor_y is None else floor_y
+    stature = top - floor
     trunk = points[(points[:, 1] > floor + 0.55 * stature) & (points[:, 1] < floor + 0.80 * stature)][:, [0, 2]]
     if len(trunk) < 50:
-        return NoPose("no trunk between the hips and the shoulders of the cloud")
+        return NoPose("nothing where a standing person's trunk should be")
+    _, directions = np.linalg.eigh(np.cov(trunk.T))
+    across = directions[:, 1]  # the widest: shoulders and arms
+    heading = float(np.arctan2(-across[1], across[0]))  # the left, +x, of a person of heading 0 turned there
     middle = np.median(trunk, axis=0) - 0.05 * stature * camera_side
-    across = _widest_direction(trunk)
-    heading = float(np.arctan2(-across[1], across[0]))  # left = +x of a person of heading 0
-    headings = (heading, heading + np.pi)
-    return _Outline(floor, stature, whole_body, middle, headings, camera_side)
+    return _Outline(floor, stature, True, middle, (heading, heading + np.pi), np.ones(len(points), np.bool_))
 
 
-def _shows_legs(points: Floats, top: float, span: float) -> bool:
-    """A standing person is 7 to 8 heads high, and the legs are narrower than the trunk and the arms."""
-    return span >= 0.9
+def _upper_body_outline(points: Floats, normals: Floats, top: float, camera_side: Floats) -> _Outline | NoPose:
+    """An upper body hangs from its head; what is out of its arms' reach, or level like a table, is not the person."""
+    head = points[points[:, 1] > top - 0.15 * AVERAGE_STATURE_M][:, [0, 2]]
+    middle = np.median(head, axis=0) - 0.04 * AVERAGE_STATURE_M * camera_side
+    aside = np.linalg.norm(points[:, [0, 2]] - middle, axis=1)
+    below = top - points[:, 1]
+    level = (normals[:, 1] > 0.8) & (below > 0.25 * AVERAGE_STATURE_M)
+    person = (aside < 0.35 * AVERAGE_STATURE_M) & (below < 0.50 * AVERAGE_STATURE_M) & ~level
+    if person.sum() < MINIMUM_POINTS:
+        return NoPose(f"{person.sum()} points around a head, at least {MINIMUM_POINTS} are needed")
+    reaching = person & (below > 0.2 * AVERAGE_STATURE_M) & (aside > 0.2 * AVERAGE_STATURE_M)
+    facing, turns_deg = camera_side, (-45.0, -15.0, 15.0, 45.0)
+    if reaching.mean() > 0.1:  # arms reach forwards, whichever side the camera sees
+        facing, turns_deg = points[reaching][:, [0, 2]].mean(axis=0) - middle, (-30.0, -10.0, 10.0, 30.0)
+    headings = tuple(float(np.arctan2(facing[0], facing[1]) + np.deg2rad(turn)) for turn in turns_deg)
+    return _Outline(top - AVERAGE_STATURE_M, AVERAGE_STATURE_M, False, middle, headings, person)
 
 
-def _widest_direction(flat: Floats) -> Floats:
-    """Unit direction (2,) of the largest spread of points (N, 2)."""
-    _, vectors = np.linalg.eigh(np.cov(flat.T))
-    widest: Floats = vectors[:, 1]
-    return widest
+def _starts(template: Template, outline: _Outline) -> list[TemplateFit]:
+    """People standing straight, in each facing and with each angle of the arms."""
+    starts = []
+    for heading in outline.headings:
+        for arms_rad, elbows_rad in STANDING_ARMS_RAD if outline.whole_body else SITTING_ARMS_RAD:
+            theta = template.prior.copy()
+            theta[0] = outline.stature_m
+            theta[ROOT : ROOT + 3] = outline.middle[0], outline.floor_y + 0.53 * outline.stature_m, outline.middle[1]
+            for side, sign in zip(SIDES, (-1.0, 1.0), strict=True):
+                theta[angle_index(template, f"{side}_upper_arm", "z")] = sign * (np.pi / 2 - arms_rad)
+                theta[angle_index(template, f"{side}_forearm", "y")] = sign * elbows_rad
+                theta[angle_index(template, f"{side}_thigh", "z")] = -sign * 0.05
+            starts.append(unfitted(theta, heading))
+    return starts
 
 
-def _start(template: Template, outline: _Outline, heading: float, arms_rad: tuple[float, float]) -> Floats:
-    """Parameters (P,) of a person standing straight, upper arms at ``arms_rad`` (left, right) from the trunk."""
-    theta = template.prior.copy()
-    theta[0] = outline.stature_m
-    theta[ROOT : ROOT + 3] = outline.middle[0], outline.floor_y + 0.53 * outline.stature_m, outline.middle[1]
-    for side, sign, angle in zip(SIDES, (-1.0, 1.0), arms_rad, strict=True):
-        theta[angle_index(template, f"{side}_upper_arm", "z")] = sign * (np.pi / 2 - angle)
-        theta[angle_index(template, f"{side}_forearm", "y")] = sign * 0.3
-        theta[angle_index(template, f"{side}_thigh", "z")] = -sign * 0.05
-    return theta
-
-
-def _best_fit(
-    template: Template, points: Floats, normals: Floats, outline: _Outline, used: NDArray[np.bool_]
-) -> TemplateFit:
+def _best_fit(template: Template, points: Floats, normals: Floats, outline: _Outline) -> TemplateFit:
     """Coarse fits from all starts, then fine ones of the two cheapest; the cheapest of those."""
+    used = np.ones(len(template.cone_links), np.bool_) if outline.whole_body else ~template.leg_cones
     floor_y = outline.floor_y if outline.whole_body else None
 
-    sizes = np.append(outline.stature_m, template.prior[1:ROOT])
-
-    def fitted(start: Floats, heading: float, count: int, iterations: int, gates_m: tuple[float, float]) -> TemplateFit:
+    def refined(
+        fits: list[TemplateFit], count: int, iterations: int, gates_m: tuple[float, float]
+    ) -> list[TemplateFit]:
         rows = np.arange(min(count, len(points))) * len(points) // min(count, len(points))
-        prior = np.concatenate([sizes, start[ROOT:]])
-        return fit_template(
-            template, points[rows], normals[rows], start, prior, heading,
-            used=used, floor_y=floor_y, iterations=iterations, gates_m=gates_m,
-        )  # fmt: skip
+        few, few_normals = points[rows], normals[rows]
+        found = [fit_template(template, few, few_normals, fit, used, floor_y, iterations, gates_m) for fit in fits]
+        return sorted(found, key=lambda fit: fit.cost)
 
-    starts = [
-        (_start(template, outline, heading, (angle, angle)), heading)
-        for heading in outline.headings
-        for angle in ARM_ANGLES_RAD
-    ]
-    coarse = [fitted(theta, heading, COARSE_POINTS, COARSE_ITERATIONS, (0.20, 0.06)) for theta, heading in starts]
-    best = sorted(coarse, key=lambda fit: fit.cost)[:2]
-    fine = [fitted(fit.theta, fit.heading, FINE_POINTS, FINE_ITERATIONS, (0.08, 0.03)) for fit in best]
-    return min(fine, key=lambda fit: fit.cost)
+    coarse = refined(_starts(template, outline), COARSE_POINTS, COARSE_ITERATIONS, COARSE_GATES_M)
+    return refined(coarse[:FINE_FITS], FINE_POINTS, FINE_ITERATIONS, FINE_GATES_M)[0]
 
 
-def _judged(template: Template, fit: TemplateFit, outline: _Outline) -> InitialPose | NoPose:
+def _judged(template: Template, fit: TemplateFit, outline: _Outline, cloud_points: int) -> InitialPose | NoPose:
     near = (fit.cone >= 0) & (np.abs(fit.distance_m) < INLIER_M)
-    quality = float(near.mean())
-    if quality < LEAST_INLIERS:
-        return NoPose(f"only {quality:.0%} of the cloud lies on a human shape: stand upright, arms a little out")
+    quality = float(near.mean() * outline.person.sum() / cloud_points)
+    if near.mean() < LEAST_INLIERS:
+        return NoPose(f"only {near.mean():.0%} of the cloud lies on a human shape: stand upright, arms a little out")
     seen = np.bincount(template.cone_links[fit.cone[near]], minlength=LINK_COUNT)
-    confidence = np.minimum(seen / 8.0, 1.0).astype(np.float32)
+    confidence = np.minimum(seen / POINTS_OF_A_SEEN_LINK, 1.0).astype(np.float32)
     rms_m = float(np.sqrt(np.mean(fit.distance_m[near] ** 2)))
     return InitialPose(
         template_skeleton(template, fit.theta),

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from common.body.skeleton import LINK_INDEX, SIDES
 from common.geometry import quaternion
-from sender.fitting.articulated_gauss_newton import INLIER_M, PoseState, Surface, closest_point
+from sender.fitting.articulated_gauss_newton import INLIER_M, PoseState, Surface, match_points
 from sender.fitting.joint_limits import JointTable
 
 Array = NDArray[Any]
@@ -93,6 +93,7 @@ def score_poses(
     cost = np.zeros(len(poses))
     near = np.empty((len(points), len(links)), np.int8)
     near[:] = links
+    hit, row, d2 = np.empty(len(points), np.int64), np.empty(len(points), np.int64), np.empty(len(points))
     for k in range(len(poses)):
         for c in range(len(links)):
             link, up = links[c], parents[links[c]]
@@ -103,8 +104,8 @@ def score_poses(
                     R[link, i, j] = 0.0
                     for m in range(3):
                         R[link, i, j] += R[up, i, m] * poses[k, c, m, j]
+        match_points(points, normals, near, R, t, surface, hit, row, d2)
         for n in range(len(points)):
-            hit, _, d2 = closest_point(points, normals, near, n, R, t, surface)
-            cost[k] += d2 / (d2 + INLIER_M**2) if hit >= 0 else 1.0
+            cost[k] += d2[n] / (d2[n] + INLIER_M**2) if hit[n] >= 0 else 1.0
         cost[k] /= max(len(points), 1)
     return cost

@@ -6,6 +6,7 @@ const BANNERS = {
   outdated: ["This page is out of date", "Reload it. If this stays, run ./scripts/setup where the receiver runs."],
   waiting: ["Waiting for sender…", "The picture starts as soon as telepose-send is up."],
   lost: ["Connection lost", "Nothing comes from the sender. The picture goes on by itself when it is back."],
+  unable: ["This browser cannot draw in 3D", "It offers no WebGL 2. Another browser, or its settings, may help."],
   receiving: ["", ""],
 };
 const STATES = { "waiting for sender": "waiting", receiving: "receiving", "connection lost": "lost" };
@@ -15,6 +16,7 @@ export class Hud {
     this.figures = Object.fromEntries([...document.querySelectorAll("[data-figure]")].map((e) => [e.dataset.figure, e]));
     this.title = document.getElementById("banner-title");
     this.detail = document.getElementById("banner-detail");
+    this.note = document.getElementById("note");
     this.ages = [];
     this.drawn = 0;
     this.since = performance.now();
@@ -29,6 +31,7 @@ export class Hud {
     document.body.dataset.state = state;
     this.title.textContent = BANNERS[state][0];
     this.detail.textContent = detail || BANNERS[state][1];
+    this.note.textContent = this.live ? detail : "";
   }
 
   setStatus(status) {
@@ -41,14 +44,17 @@ export class Hud {
     this.receivedAgeMs = status.pose_age_ms;
   }
 
-  /** A new pose is on screen, `ageMs` after its capture (not a number: unknown). */
-  countFrame(ageMs) {
+  /** A new pose is on screen. */
+  countFrame() {
     this.drawn += 1;
-    if (Number.isFinite(ageMs)) this.ages.push(ageMs);
   }
 
-  /** Once a second: how many poses were drawn, and how old they were (median). */
-  tick(now) {
+  /**
+   * At every display tick, with the age of the pose on screen then (not a number: unknown). Once a second it writes
+   * how many poses were drawn and how old they were (median).
+   */
+  tick(now, ageMs) {
+    if (Number.isFinite(ageMs)) this.ages.push(ageMs);
     const elapsed = now - this.since;
     if (elapsed < 1000) return;
     const age = this.ages.length ? this.ages.sort((a, b) => a - b)[this.ages.length >> 1] : this.receivedAgeMs;

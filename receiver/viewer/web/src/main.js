@@ -8,12 +8,12 @@ import { SkeletonOverlay } from "./skeleton.js";
 import { Stage } from "./stage.js";
 
 const hud = new Hud();
-const stage = new Stage(document.getElementById("stage"));
+const stage = openStage(document.getElementById("stage"));
 const person = new Person(stage.scene);
 const skeleton = new SkeletonOverlay(stage.scene);
 
 let newest = null; // the frame to draw next; an older one not drawn yet is skipped
-let arrivedAt = 0;
+let capturedAt = NaN; // when what is on screen was captured, on this page's clock
 let drawnAt = performance.now();
 
 connect({
@@ -28,8 +28,7 @@ connect({
   pose: (message) => person.add(message),
   remove: ({ poseId }) => person.remove(poseId),
   frame(frame) {
-    newest = frame;
-    arrivedAt = performance.now();
+    newest = { ...frame, capturedAt: performance.now() - frame.ageMs };
   },
   outdated: () => hud.setState("outdated"),
   closed() {
@@ -37,6 +36,16 @@ connect({
     setPresence();
   },
 });
+
+function openStage(canvas) {
+  canvas.addEventListener("webglcontextrestored", () => location.reload()); // the meshes were on the GPU alone
+  try {
+    return new Stage(canvas);
+  } catch (error) {
+    hud.setState("unable");
+    throw error;
+  }
+}
 
 function setPresence() {
   person.presence = hud.live ? 1 : 0;
@@ -49,12 +58,13 @@ function draw(now) {
     person.show(newest);
     skeleton.show(newest);
     stage.follow(newest.joints, (now - drawnAt) / 1000);
-    hud.countFrame(newest.ageMs + performance.now() - arrivedAt);
+    hud.countFrame();
+    capturedAt = newest.capturedAt;
     newest = null;
     drawnAt = now;
   }
   stage.draw();
-  hud.tick(now);
+  hud.tick(now, performance.now() - capturedAt);
 }
 requestAnimationFrame(draw);
 

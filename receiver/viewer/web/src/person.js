@@ -77,12 +77,11 @@ export class Person {
     for (const poseId of [...this.meshes.keys()]) this.remove(poseId);
   }
 
-  /** Shows the frame's pose; false while its mesh is not here yet (then the last one stays as it was). */
+  /** Shows the frame's pose, nobody if it has none; while its mesh is not here yet the last one stays as it was. */
   show({ poseId, motion }) {
-    if (!this.meshes.has(poseId)) return false;
+    if (poseId !== null && !this.meshes.has(poseId)) return;
     this.shared.motion.value.set(motion);
     for (const [id, mesh] of this.meshes) mesh.visible = id === poseId;
-    return true;
   }
 
   /** 1 = live, 0 = grey: the picture is old. */

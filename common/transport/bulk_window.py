@@ -1,0 +1,327 @@
+"""How much bulk may be on its way to one receiver, so that it never delays a skeleton noticeably.
+
+A window of the LEDBAT family (RFC 6817; SCReAM, RFC 8298): it grows while the queueing delay that skeletons see stays
+below a target and shrinks above. The delay comes from the receiver's reports, so clocks need no common zero. It stops
+by itself when reports stop, and no report can make it exceed its bounds. Pure: time is an argument.
+"""
+
+from __future__ import annotations
+
+import statistics
+from collections import Counter, deque
+from dataclasses import dataclass
+
+from common.transport.chunks import CHUNK_MAX_BYTES
+from common.wire.receiver_report import ReceiverReport
+
+NS = 1e-9
+ROUND_TRIP_MAX_NS = 10_000_000_000
+FIRST_WINDOW_BYTES = 16 << 10
+CHUNK_LEAST_BYTES = 1200
+CHUNK_HOLDS_S = 0.008  # how long one chunk may hold up a skeleton behind it on the link
+BUCKET_NS, BUCKETS = 5_000_000_000, 12  # the delay's base is the least of the last minute
+PACING = 1.1  # of the window per round trip: a little more than it allows, so that pacing is not the limit
+BURST_NS = 10_000_000  # how far pacing may lag behind and catch up
+GAIN = 2.0
+SLOW_START_GAIN = 0.5
+BULK_SHARE = 0.5  # how much of the delay that only chunks see counts
+LOSS_FACTOR = 0.8
+
+
+@dataclass(frozen=True, slots=True)
+class WindowSettings:
+    """``target_ms``: queueing delay to stay at [ms]. ``floor_bps``: what bulk may use whatever the delay [bit/s].
+    ``max_window_bytes``: most bytes in flight. ``report_period_ms``: how often the receiver reports [ms]."""
+
+    target_ms: float = 15.0
+    floor_bps: int = 100_000
+    max_window_bytes: int = 4 << 20
+    report_period_ms: float = 50.0
+
+    def __post_init__(self) -> None:
+        if not 1.0 <= self.target_ms <= 200.0:
+            raise ValueError(f"target_ms: {self.target_ms} is outside 1..200")
+        if not 8_000 <= self.floor_bps <= 1_000_000_000:
+            raise ValueError(f"floor_bps: {self.floor_bps} is outside 8000..1e9")
+        if not 2 * CHUNK_MAX_BYTES <= self.max_window_bytes <= 32 << 20:
+            raise ValueError(f"max_window_bytes: {self.max_window_bytes} is outside 64 KiB..32 MiB")
+        if not 5.0 <= self.report_period_ms <= 1000.0:
+            raise ValueError(f"report_period_ms: {self.report_period_ms} is outside 5..1000")
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """Sequence numbers of chunks that are no longer in flight: arrived, or lost and to be sent again.
+
+    ``restarted``: the receiver is a new one and has nothing of what was acknowledged before.
+    """
+
+    arrived: tuple[int, ...] = ()
+    lost: tuple[int, ...] = ()
+    restarted: bool = False
+
+
+class _LeastOfLate:
+    """The least value of the last ``BUCKETS`` x 5 s that had any."""
+
+    def __init__(self) -> None:
+        self._buckets: deque[tuple[int, int]] = deque(maxlen=BUCKETS)  # (which 5 s, least value in them)
+
+    def add(self, value: int, now_ns: int) -> None:
+        bucket = now_ns // BUCKET_NS
+        if self._buckets and self._buckets[-1][0] == bucket:
+            value = min(value, self._buckets.pop()[1])
+        self._buckets.append((bucket, value))
+
+    @property
+    def least(self) -> int | None:
+        return min((value for _, value in self._buckets), default=None)
+
+
+class _Path:
+    """Round trip and queueing delay, as the reports tell them. All in seconds."""
+
+    def __init__(self) -> None:
+        self.round_trip_s = 0.2  # until the first sample
+        self.queueing_s = 0.0
+        self._round_trips_ns = _LeastOfLate()
+        self._delays_ns = _LeastOfLate()
+
+    @property
+    def least_round_trip_s(self) -> float:
+        least_ns = self._round_trips_ns.least
+        return self.round_trip_s if least_ns is None else least_ns * NS
+
+    def update(self, report: ReceiverReport, chunk_s: float, acked_ns: int | None, now_ns: int) -> None:
+        """``chunk_s``: how long the link takes for one chunk. ``acked_ns``: when the newest chunk that this report
+        acknowledges was sent, or None."""
+        sent_ns, hold_ns = acked_ns, 0  # without skeletons: too long by what the chunk waited for the report
+        if report.skeleton_send_ns is not None:
+            sent_ns, hold_ns = report.skeleton_send_ns, report.skeleton_hold_ns
+        if sent_ns is not None and 0 < now_ns - sent_ns - hold_ns < ROUND_TRIP_MAX_NS:
+            sample_ns = now_ns - sent_ns - hold_ns
+            first = self._round_trips_ns.least is None
+            self.round_trip_s += (sample_ns * NS - self.round_trip_s) * (1 if first else 1 / 8)
+            self._round_trips_ns.add(sample_ns, now_ns)
+        d_s, d_b = report.skeleton_delay_ns, report.bulk_delay_ns
+        delays_ns = [delay_ns for delay_ns in (d_s, d_b) if delay_ns is not None]
+        if not delays_ns:
+            return
+        self._delays_ns.add(min(delays_ns), now_ns)
+        base_ns = self._delays_ns.least
+        assert base_ns is not None
+        seen_s = (d_s - base_ns) * NS if d_s is not None else 0.0
+        # Chunks may queue where skeletons do not, above a second link say: without this the window would not see it.
+        own_s = ((d_b - base_ns) * NS - chunk_s) * BULK_SHARE if d_b is not None else 0.0
+        self.queueing_s = max(seen_s, own_s, 0.0)
+
+
+class BulkWindow:
+    """The window towards one receiver, for chunks of the sender's run ``epoch``.
+
+    ``counts``: by cause, reports that were not used and chunks that were lost.
+    """
+
+    def __init__(self, epoch: int, settings: WindowSettings | None = None) -> None:
+        self.counts: Counter[str] = Counter()
+        self._epoch = epoch
+        self._settings = settings or WindowSettings()
+        self._target_s = self._settings.target_ms * 1e-3  # τ
+        self._period_s = self._settings.report_period_ms * 1e-3  # T
+        self._in_flight: dict[int, tuple[int, int]] = {}  # sequence number → bytes, when sent; ascending
+        self._in_flight_bytes = 0
+        self._next_sequence = 0
+        self._next_send_ns = 0
+        self._progress_ns = 0
+        self._last: tuple[ReceiverReport, int] | None = None  # and when it came
+        self._path = _Path()
+        self._rates: deque[float] = deque(maxlen=40)  # R_i [bytes/s]
+        self._begin_slow_start(FIRST_WINDOW_BYTES)
+
+    @property
+    def window_bytes(self) -> int:
+        """W: how many bytes may be in flight."""
+        return int(self._window)
+
+    @property
+    def in_flight_bytes(self) -> int:
+        return self._in_flight_bytes
+
+    @property
+    def oldest_sequence(self) -> int:
+        """The lowest sequence number in flight, or the next one to be used."""
+        return next(iter(self._in_flight), self._next_sequence)
+
+    @property
+    def next_sequence(self) -> int:
+        """The sequence number the next chunk has to carry."""
+        return self._next_sequence
+
+    @property
+    def queueing_delay_s(self) -> float:
+        """q: how long packets wait in queues on the way, at the last report."""
+        return self._path.queueing_s
+
+    @property
+    def rate_bytes_s(self) -> float:
+        """R̂: what the path delivers [bytes/s]; before the first sample 16 KB per round trip."""
+        if not self._rates:
+            return FIRST_WINDOW_BYTES / (self._path.round_trip_s + self._period_s)
+        return statistics.median(self._rates)
+
+    @property
+    def chunk_bytes(self) -> int:
+        """C: how large a chunk should be now."""
+        return int(min(max(self.rate_bytes_s * CHUNK_HOLDS_S, CHUNK_LEAST_BYTES), CHUNK_MAX_BYTES))
+
+    def budget_bytes(self, period_ns: int) -> int:
+        """How many more bytes the path takes within ``period_ns``."""
+        return max(0, int(0.9 * self.rate_bytes_s * period_ns * NS) - self._in_flight_bytes)
+
+    def time_to_deliver_s(self, size: int) -> float:
+        """Roughly how long ``size`` bytes take to arrive."""
+        return (self._in_flight_bytes + size) / self.rate_bytes_s + self._path.round_trip_s / 2
+
+    def next_send_ns(self, size: int, now_ns: int) -> int | None:
+        """When a chunk of ``size`` bytes may go, perhaps in the past; None: not before another report."""
+        if self._silent(now_ns) or (self._in_flight and self._in_flight_bytes + size > self._window):
+            return None
+        return self._next_send_ns
+
+    def on_sent(self, size: int, now_ns: int) -> int:
+        """A chunk of ``size`` bytes goes out now; returns its sequence number."""
+        if not self._in_flight:
+            self._progress_ns = now_ns
+        sequence = self._next_sequence
+        self._next_sequence += 1
+        self._in_flight[sequence] = (size, now_ns)
+        self._in_flight_bytes += size
+        pace_bytes_s = PACING * self._window / (self._path.round_trip_s + self._period_s)
+        self._next_send_ns = max(self._next_send_ns, now_ns - BURST_NS) + int(size / pace_bytes_s / NS)
+        return sequence
+
+    def on_report(self, report: ReceiverReport, now_ns: int) -> Outcome:
+        """Take a report in: which chunks are no longer in flight, and a new window."""
+        if not self._usable(report, now_ns):
+            return Outcome()
+        was_silent = self._silent(now_ns)
+        before, self._last = self._last, (report, now_ns)
+        if before is not None and before[0].receiver_epoch != report.receiver_epoch:
+            return self._on_restart()
+        if report.sender_epoch != self._epoch:
+            return Outcome()  # it has not heard of this run yet; but it is there
+        outstanding = self._in_flight_bytes
+        outcome, acked, acked_ns = self._resolve(report)
+        self._path.update(report, self.chunk_bytes / self.rate_bytes_s, acked_ns, now_ns)
+        if outcome.arrived:
+            self._progress_ns = now_ns
+        if was_silent:
+            self._begin_slow_start(FIRST_WINDOW_BYTES)
+        else:
+            limited = outstanding > self._window / 2  # otherwise the sample says nothing about the path
+            if acked and limited and before is not None:
+                period_s = max((report.clock_ns - before[0].clock_ns) * NS, self._period_s / 4)
+                self._rates.append(acked / period_s)
+            self._adapt(acked if limited else 0, now_ns)
+        if outcome.lost:
+            self._reduce(now_ns)
+        return outcome
+
+    def expire(self, now_ns: int) -> Outcome:
+        """Write off everything in flight when nothing was acknowledged for long, or it would count for ever."""
+        if not self._in_flight or (now_ns - self._progress_ns) * NS <= max(1.0, 4 * self._path.round_trip_s):
+            return Outcome()
+        self.counts["written off"] += len(self._in_flight)
+        self._begin_slow_start(FIRST_WINDOW_BYTES)
+        return Outcome(lost=self._write_off())
+
+    def _usable(self, report: ReceiverReport, now_ns: int) -> bool:
+        if self._last is None:
+            return True
+        last, last_ns = self._last
+        if report.receiver_epoch == last.receiver_epoch and report.number <= last.number:
+            self.counts["old report"] += 1
+            return False
+        if (now_ns - last_ns) * NS < self._period_s / 4:
+            self.counts["report too soon"] += 1  # nothing is lost with it: reports are cumulative
+            return False
+        return True
+
+    def _silent(self, now_ns: int) -> bool:
+        limit_s = max(0.4, 4 * self._period_s + 2 * self._path.least_round_trip_s)
+        return self._last is None or (now_ns - self._last[1]) * NS > limit_s
+
+    def _on_restart(self) -> Outcome:
+        self._path = _Path()
+        self._begin_slow_start(FIRST_WINDOW_BYTES)
+        return Outcome(lost=self._write_off(), restarted=True)
+
+    def _write_off(self) -> tuple[int, ...]:
+        lost = tuple(self._in_flight)
+        self._in_flight.clear()
+        self._in_flight_bytes = 0
+        return lost
+
+    def _resolve(self, report: ReceiverReport) -> tuple[Outcome, int, int | None]:
+        """Chunks below "next expected" have arrived, but for the missing ones; with it how many bytes arrived, and when
+        the newest of them was sent."""
+        if report.next_chunk > self._next_sequence:
+            self.counts["future chunk"] += 1
+        missing = set(report.missing_chunks)
+        resolved = [sequence for sequence in self._in_flight if sequence < report.next_chunk]
+        lost = tuple(sequence for sequence in resolved if sequence in missing)
+        arrived = tuple(sequence for sequence in resolved if sequence not in missing)
+        acked_ns = self._in_flight[arrived[-1]][1] if arrived else None
+        lost_bytes, acked = (sum(self._in_flight.pop(chunk)[0] for chunk in chunks) for chunks in (lost, arrived))
+        self._in_flight_bytes -= lost_bytes + acked
+        self.counts["lost"] += len(lost)
+        return Outcome(arrived, lost), acked, acked_ns
+
+    def _begin_slow_start(self, window_bytes: float) -> None:
+        self._slow_start = True
+        self._window = float(window_bytes)
+        self._rates.clear()
+        self._short_queue_since_ns: int | None = None
+        self._reduced_ns = 0
+
+    def _adapt(self, acked: int, now_ns: int) -> None:
+        """The new window after ``acked`` bytes arrived while it was the window that limited them."""
+        q, target = self._path.queueing_s, self._target_s
+        round_trip_s = self._path.least_round_trip_s + self._period_s
+        if self._slow_start:
+            if q > target / 2 and self._rates:
+                self._slow_start = False
+                self._window = max(list(self._rates)[-4:]) * round_trip_s
+            else:
+                self._window += acked * SLOW_START_GAIN
+        elif acked:
+            gain = GAIN * max(1.0, round_trip_s / 0.1)
+            self._window += max(
+                -self._window / 4, gain * (target - q) / target * acked * self.chunk_bytes / self._window
+            )
+        if q > 3 * target and self._rates:
+            self._window = min(self._window, 0.85 * self._rates[-1] * round_trip_s)
+        self._clamp()
+        self._seek_room(acked, now_ns)
+
+    def _seek_room(self, acked: int, now_ns: int) -> None:
+        """Into slow start again when the queue stays short although the window is used: the path has room."""
+        if self._slow_start or self._path.queueing_s > self._target_s / 2:
+            self._short_queue_since_ns = None
+        elif self._short_queue_since_ns is None:
+            self._short_queue_since_ns = now_ns if acked else None
+        elif (now_ns - self._short_queue_since_ns) * NS > max(1.0, 3 * (self._path.round_trip_s + self._period_s)):
+            self._short_queue_since_ns = None
+            self._slow_start = acked > 0
+
+    def _reduce(self, now_ns: int) -> None:
+        """Chunks were lost: a queue somewhere is full, though short. Once per round trip."""
+        if (now_ns - self._reduced_ns) * NS > self._path.round_trip_s + self._period_s:
+            self._reduced_ns = now_ns
+            self._slow_start = False
+            self._window *= LOSS_FACTOR
+            self._clamp()
+
+    def _clamp(self) -> None:
+        floor = self._settings.floor_bps / 8 * (self._path.round_trip_s + self._period_s)
+        self._window = min(max(self._window, 2 * self.chunk_bytes, floor), self._settings.max_window_bytes)

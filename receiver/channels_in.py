@@ -1,0 +1,188 @@
+"""What the receiver hears and says: skeletons, bodies and chunks in; reports, questions and presence out.
+
+Decodes and judges what arrives, on the loop, and hands on what is worth showing. Counting is here too, since a report
+is made of it.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+from common.body.skeleton import Skeleton
+from common.runtime.clock import Clock
+from common.transport import channels
+from common.transport.bulk_arrivals import BulkArrivals, LeastDelay
+from common.transport.channel_publisher import ChannelPublisher
+from common.transport.channel_query import ask
+from common.transport.channel_subscriber import Arrival, ChannelSubscriber
+from common.transport.channels import Channel, channel_key
+from common.transport.chunks import ChunkAssembler, decode_chunk
+from common.transport.clock_offset import ClockOffset
+from common.transport.zenoh_session import ZenohSession
+from common.wire.body_message import decode_body
+from common.wire.header import WireError
+from common.wire.receiver_report import ReceiverReport, encode_report
+from common.wire.skeleton_packet import SkeletonPacket, decode_skeleton
+from receiver.skeleton_buffer import SkeletonBuffer
+
+CLOCK_ANSWER = struct.Struct("<q")  # the sender's monotonic time [ns]
+
+
+@dataclass(frozen=True, slots=True)
+class Handlers:
+    """Called on the loop. ``skeleton(packet, its body, its bytes)``; ``pose(message)``; ``body(message)``; ``epoch()``:
+    a new run of the sender has begun; ``presence(there)``."""
+
+    skeleton: Callable[[SkeletonPacket, Skeleton, bytes], None]
+    pose: Callable[[bytes], None]
+    body: Callable[[bytes], None]
+    epoch: Callable[[], None]
+    presence: Callable[[bool], None]
+
+
+@dataclass(slots=True)
+class _Bodies:
+    """Sizes by revision, of one sender epoch."""
+
+    epoch: int | None = None
+    by_revision: dict[int, Skeleton] = field(default_factory=dict)
+    newest_revision: int | None = None
+
+
+class ReceiverChannels:
+    """One person's incoming stream."""
+
+    def __init__(
+        self, session: ZenohSession, site: str, person: int, name: str, receiver_id: int, epoch: int, clock: Clock
+    ) -> None:
+        self.counts: Counter[str] = Counter()
+        self.clock_offset = ClockOffset()
+        self.skeletons = SkeletonBuffer()
+        self.assembler = ChunkAssembler()
+        self.subscribers: dict[str, ChannelSubscriber] = {}
+        self._session = session
+        self._site, self._person, self._name = site, person, name
+        self._receiver_id, self._epoch = receiver_id, epoch
+        self._clock = clock
+        self._arrivals = BulkArrivals()
+        self._skeleton_delay, self._bulk_delay = LeastDelay(), LeastDelay()
+        self._skeleton_arrival_ns = 0
+        self._bodies = _Bodies()
+        self._reports = 0
+        self._report = ChannelPublisher(session, channels.REPORT, self._key(channels.REPORT, name))
+        self._handlers: Handlers | None = None
+
+    def open(self, handlers: Handlers) -> None:
+        """Listen, and be seen."""
+        self._handlers = handlers
+        for channel, receiver, on_arrival in (
+            (channels.SKELETON, None, self._on_skeleton),
+            (channels.BODY, None, self._on_body),
+            (channels.BULK, self._name, self._on_chunk),
+        ):
+            key = self._key(channel, receiver)
+            self.subscribers[channel.name] = ChannelSubscriber(self._session, channel, key, on_arrival, self._clock)
+        self._session.declare_presence(self._key(channels.RECEIVER_PRESENCE, self._name))
+        self._session.watch_presence(self._key(channels.SENDER_PRESENCE), lambda _, present: handlers.presence(present))
+
+    def send_report(self, repository_poses: int) -> None:
+        """Tell the sender's bulk window how things are."""
+        newest = self.skeletons.newest
+        now_ns = self._clock.now_ns()
+        next_chunk, missing = self._arrivals.resolved()
+        self._reports += 1
+        report = ReceiverReport(
+            number=self._reports,
+            receiver_id=self._receiver_id,
+            receiver_epoch=self._epoch,
+            sender_epoch=self._arrivals.epoch if self._arrivals.epoch is not None else newest.epoch if newest else None,
+            clock_ns=now_ns,
+            skeleton_send_ns=newest.capture_ns if newest else None,
+            skeleton_hold_ns=max(now_ns - self._skeleton_arrival_ns, 0) if newest else 0,
+            skeleton_delay_ns=self._skeleton_delay.take(),
+            bulk_delay_ns=self._bulk_delay.take(),
+            bulk_bytes=self._arrivals.bulk_bytes,
+            next_chunk=next_chunk,
+            missing_chunks=missing,
+            body_revision=self._bodies.newest_revision,
+            repository_poses=repository_poses,
+        )
+        self._report.put(encode_report(report))
+
+    async def ask_time(self) -> None:
+        """One exchange of times with the sender."""
+        sent_ns = self._clock.now_ns()
+        answers = await ask(self._session, channels.CLOCK, self._key(channels.CLOCK), timeout_s=0.5)
+        if len(answers) == 1 and len(answers[0]) == CLOCK_ANSWER.size:
+            (remote_ns,) = CLOCK_ANSWER.unpack(answers[0])
+            self.clock_offset.add(sent_ns, remote_ns, remote_ns, self._clock.now_ns())
+        elif answers:
+            self.counts["clock answer refused"] += 1
+
+    async def ask_body(self) -> None:
+        """Ask for the person's sizes, which are published only when they change."""
+        for answer in await ask(self._session, channels.BODY, self._key(channels.BODY)):
+            try:
+                self._take_body(answer)
+            except WireError:
+                self.counts["body malformed"] += 1
+
+    @property
+    def lacks_body(self) -> bool:
+        """A skeleton came whose body has not."""
+        newest = self.skeletons.newest
+        return newest is not None and not self._knows(newest)
+
+    def age_ns(self, capture_ns: int, now_ns: int) -> int | None:
+        """How long ago a capture time of the sender was, by our clock; None while its offset is unknown."""
+        return now_ns - self.clock_offset.to_local_ns(capture_ns, now_ns) if self.clock_offset.known else None
+
+    def _on_skeleton(self, arrival: Arrival) -> None:
+        assert self._handlers is not None
+        packet = decode_skeleton(arrival.payload)
+        before = self.skeletons.newest
+        if packet.person != self._person:
+            raise WireError(f"skeleton of person {packet.person} under person {self._person}'s key")
+        if not self.skeletons.push(packet, arrival.arrival_ns):
+            return
+        if before is not None and before.epoch != packet.epoch:
+            self.clock_offset.forget()
+            self._handlers.epoch()
+        self._skeleton_arrival_ns = arrival.arrival_ns
+        self._skeleton_delay.note(packet.capture_ns, arrival.arrival_ns)
+        if self._knows(packet):
+            self._handlers.skeleton(packet, self._bodies.by_revision[packet.body_revision], arrival.payload)
+        else:
+            self.counts["body unknown"] += 1
+
+    def _on_body(self, arrival: Arrival) -> None:
+        self._take_body(arrival.payload)
+
+    def _take_body(self, data: bytes) -> None:
+        assert self._handlers is not None
+        message = decode_body(data)
+        if message.person != self._person:
+            raise WireError(f"body of person {message.person} under person {self._person}'s key")
+        if message.epoch != self._bodies.epoch:
+            self._bodies = _Bodies(message.epoch)
+        self._bodies.by_revision[message.revision] = message.skeleton
+        self._bodies.newest_revision = message.revision
+        self._handlers.body(data)
+
+    def _on_chunk(self, arrival: Arrival) -> None:
+        assert self._handlers is not None
+        chunk = decode_chunk(arrival.payload)
+        message = self.assembler.push(chunk)
+        self._arrivals.note(chunk, len(arrival.payload))
+        self._bulk_delay.note(chunk.send_ns, arrival.arrival_ns)
+        if message is not None:
+            self._handlers.pose(message)
+
+    def _knows(self, packet: SkeletonPacket) -> bool:
+        return packet.epoch == self._bodies.epoch and packet.body_revision in self._bodies.by_revision
+
+    def _key(self, channel: Channel, receiver: str | None = None) -> str:
+        return channel_key(channel, self._site, self._person, receiver)

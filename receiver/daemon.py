@@ -1,0 +1,275 @@
+"""The receiver daemon: skeletons and candidate poses in, a moving person out.
+
+The newest skeleton goes to the animation thread (newest wins), whose result the loop shows. Candidate poses are meshed
+one after the other on a thread of their own, so that a mesh never holds up a skeleton.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import secrets
+from collections import Counter, deque
+from collections.abc import Callable
+from typing import Any
+
+from common.body.skeleton import Skeleton
+from common.runtime.clock import MonotonicClock
+from common.runtime.compute_worker import ComputeWorker
+from common.runtime.daemon import Daemon, DaemonError
+from common.runtime.metrics import Health, Metrics, daemon_app, serve_app
+from common.runtime.run_statistics import RunStatistics, write_statistics
+from common.runtime.stage_timer import StageTimer
+from common.transport.zenoh_session import ZenohSession, open_session, with_endpoints
+from common.wire.header import WireError
+from common.wire.skeleton_packet import SkeletonPacket
+from receiver.channels_in import Handlers, ReceiverChannels
+from receiver.config import ReceiverSettings
+from receiver.pipeline import AnimationPath, ReceivedPose, Shown, SkeletonToShow, mesh_of
+from receiver.show_log import ShowLog
+from receiver.stream_state import StreamState
+from receiver.viewer.headless_screen import HeadlessScreen
+from receiver.viewer.web_viewer import WebViewer
+
+log = logging.getLogger(__name__)
+
+REPORT_PERIOD_S = 0.05
+STATUS_PERIOD_S = 0.25
+CLOCK_PERIOD_S = 1.0
+CLOCK_QUICK_PERIOD_S = 0.1  # until the offset is known
+BODY_PERIOD_S = 0.1
+MESHES_WAITING = 8
+
+
+class ReceiverDaemon:
+    """Runs until it is stopped."""
+
+    def __init__(self, settings: ReceiverSettings) -> None:
+        self._settings = settings
+        self._clock = MonotonicClock()
+        self._health = Health()
+
+    async def run(self, daemon: Daemon) -> None:
+        """The daemon's main coroutine.
+
+        Raises:
+            DaemonError: a port or file that cannot be used; the message says which.
+        """
+        settings = self._settings
+        async with open_session(with_endpoints(settings.link, "receiver")) as session:
+            show = _Show(settings, session, self._clock, self._health)
+            app = daemon_app(show.metrics, self._health)
+            if isinstance(show.viewer, WebViewer):
+                show.viewer.add_routes(app)
+            try:
+                async with serve_app(app, settings.http.host, settings.http.port) as port:
+                    what = "metrics" if settings.view.headless else "the page"
+                    log.info("%s on http://%s:%d/", what, settings.http.host, port)
+                    await show.run(daemon)
+            except OSError as error:
+                raise DaemonError(f"http: {error}") from error
+            finally:
+                show.close()
+                if settings.stats_file is not None:
+                    write_statistics(settings.stats_file, show.figures())
+
+
+class _Show:
+    """One run with one open session."""
+
+    def __init__(
+        self, settings: ReceiverSettings, session: ZenohSession, clock: MonotonicClock, health: Health
+    ) -> None:
+        self._settings = settings
+        self._clock = clock
+        self._health = health
+        self._timer = StageTimer(clock)
+        self._statistics = RunStatistics(self._timer)
+        self._counts: Counter[str] = Counter()
+        name = settings.name or secrets.token_hex(4)
+        self._channels = ReceiverChannels(
+            session, settings.site, settings.person, name, secrets.randbits(64), secrets.randbits(32), clock
+        )
+        self._state = StreamState(clock)
+        self._animation_path = AnimationPath(settings.repository, self._timer, clock)
+        self._animation = ComputeWorker("animation", self._animation_path.show, self._on_shown)
+        self._messages: asyncio.Queue[bytes] = asyncio.Queue(MESHES_WAITING)
+        self._meshes: deque[ReceivedPose] = deque()  # meshed, waiting for the next skeleton; bounded in _mesh_poses
+        self._log = ShowLog(settings.shown_log) if settings.shown_log else None
+        self.viewer: WebViewer | HeadlessScreen = (
+            HeadlessScreen(self._timer)
+            if settings.view.headless
+            else WebViewer(allowed_hosts=settings.view.allowed_hosts)
+        )
+        self.metrics = self._make_metrics()
+
+    async def run(self, daemon: Daemon) -> None:
+        """Receive and show until cancelled."""
+        self._channels.open(
+            Handlers(self._on_skeleton, self._on_pose, self._on_body, self._on_epoch, self._state.presence)
+        )
+        async with asyncio.TaskGroup() as group:
+            group.create_task(self._animation.run())
+            group.create_task(self._mesh_poses())
+            group.create_task(self._every(REPORT_PERIOD_S, self._report))
+            group.create_task(self._every(STATUS_PERIOD_S, self._tell_status))
+            group.create_task(self._every(1 / self._settings.view.display_hz, self._tick))
+            group.create_task(self._keep_time())
+            group.create_task(self._keep_body())
+            if isinstance(self.viewer, HeadlessScreen):
+                group.create_task(self.viewer.run())
+            await self._animation.wait_ready()
+            daemon.announce_ready()
+
+    def close(self) -> None:
+        """Write out what is buffered."""
+        if self._log is not None:
+            self._log.close()
+
+    def _on_skeleton(self, packet: SkeletonPacket, body: Skeleton, data: bytes) -> None:
+        self._state.skeleton()
+        self._record("skeleton", data)
+        self._animation.submit(SkeletonToShow(packet, body, self._meshes))
+
+    def _on_body(self, message: bytes) -> None:
+        self._record("body", message)
+
+    def _on_epoch(self) -> None:
+        log.info("the sender has started anew")
+
+    def _on_pose(self, message: bytes) -> None:
+        """A candidate pose is complete; when too many wait for meshing the oldest goes."""
+        self._record("pose", message)
+        if self._messages.full():
+            self._messages.get_nowait()
+            self._counts["pose waiting too long"] += 1
+        self._messages.put_nowait(message)
+
+    async def _mesh_poses(self) -> None:
+        """Mesh candidate poses, one after the other."""
+        while True:
+            message = await self._messages.get()
+            try:
+                with self._timer.stage("mesh"):
+                    mesh = await asyncio.to_thread(mesh_of, message, self._settings.person)
+            except WireError as error:
+                self._counts["pose refused"] += 1
+                log.warning("a candidate pose is refused: %s", error)
+                continue
+            while len(self._meshes) >= MESHES_WAITING:  # no skeletons come: nobody takes them
+                self._meshes.popleft()
+                self._counts["pose waiting too long"] += 1
+            self._meshes.append(mesh)
+
+    def _on_shown(self, shown: Shown) -> None:
+        """On the loop: the animated mesh is ready."""
+        now_ns = self._clock.now_ns()
+        for pose_id in shown.removed:
+            self.viewer.remove_pose(pose_id)
+        for mesh in shown.added:
+            self.viewer.add_pose(mesh)
+        self._counts += shown.counts
+        frame = shown.frame
+        if frame is None:
+            self._counts["withheld"] += 1
+            return
+        self.viewer.show(frame)
+        self._state.shown(frame, shown.repository_poses)
+        latency_ns = self._channels.age_ns(frame.capture_ns, now_ns)
+        if latency_ns is not None:
+            self._timer.add("capture to shown", latency_ns)
+        sigma = None if frame.pose_id is None else frame.sigma
+        self._record("frame", [shown.epoch, frame.sequence, frame.pose_id, sigma, latency_ns])
+
+    def _tick(self) -> None:
+        """A display tick: what is on screen now, and how old."""
+        frame = self._state.frame
+        age_ns = None if frame is None else self._channels.age_ns(frame.capture_ns, self._clock.now_ns())
+        if age_ns is not None:
+            self._timer.add("pose age at tick", age_ns)
+        self._record("tick", [None if frame is None else frame.sequence, age_ns])
+        if isinstance(self.viewer, HeadlessScreen):
+            self.viewer.tick()
+
+    def _report(self) -> None:
+        self._channels.send_report(self._state.repository_poses)
+
+    def _tell_status(self) -> None:
+        frame = self._state.frame
+        age_ns = None if frame is None else self._channels.age_ns(frame.capture_ns, self._clock.now_ns())
+        subscribers = self._channels.subscribers
+        status = self._state.status(
+            age_ms=None if age_ns is None else age_ns / 1e6,
+            skeleton_bytes=subscribers["skeleton"].arrived_bytes,
+            bulk_bytes=subscribers["bulk"].arrived_bytes,
+        )
+        self._health.ready, self._health.reason = self._state.receiving, status.connection.value
+        self.viewer.set_status(status)
+
+    async def _keep_time(self) -> None:
+        while True:
+            await self._channels.ask_time()
+            await asyncio.sleep(CLOCK_PERIOD_S if self._channels.clock_offset.known else CLOCK_QUICK_PERIOD_S)
+
+    async def _keep_body(self) -> None:
+        """Ask for the sizes that newly arrived skeletons refer to, when they were published before we came."""
+        while True:
+            await asyncio.sleep(BODY_PERIOD_S)
+            if self._channels.lacks_body:
+                await self._channels.ask_body()
+
+    async def _every(self, period_s: float, action: Callable[[], None]) -> None:
+        """Call ``action`` at a steady rate; ticks that were missed are left out."""
+        loop = asyncio.get_running_loop()
+        due_s = loop.time()
+        while True:
+            action()
+            due_s = max(due_s + period_s, loop.time())
+            await asyncio.sleep(due_s - loop.time())
+
+    def _record(self, kind: str, payload: bytes | list[Any]) -> None:
+        if self._log is not None:
+            self._log.add(kind, self._clock.now_ns(), payload)
+
+    def _make_metrics(self) -> Metrics:
+        metrics = Metrics()
+        metrics.stages(self._timer)
+        skeletons = self._channels.skeletons.counts
+        metrics.counter("skeletons_received_total", "Skeletons that were the newest", lambda: skeletons["accepted"])
+        metrics.counter("skeletons_lost_total", "Gaps in the sequence", lambda: skeletons["lost"])
+        metrics.counter("frames_shown_total", "Frames given to the viewer", lambda: self._state.frames_shown)
+        metrics.counter("dropped_total", "What was dropped, by cause", self._dropped)
+        metrics.gauge("repository_poses", "Candidate poses held", lambda: self._state.repository_poses)
+        return metrics
+
+    def _dropped(self) -> dict[str, float]:
+        channels = self._channels
+        judged = {f"skeleton {cause}": channels.skeletons.counts[cause] for cause in
+                  ("stale", "duplicate", "old_epoch", "far_future", "lost")}  # fmt: skip
+        refused = {
+            f"{name} {cause}": count
+            for name, subscriber in channels.subscribers.items()
+            for cause, count in subscriber.counts.items()
+        }
+        chunks = {f"chunk {cause}": count for cause, count in channels.assembler.counts.items()}
+        return {
+            "animation busy": self._animation.dropped,
+            **judged,
+            **refused,
+            **chunks,
+            **channels.counts,
+            **self._counts,
+        }
+
+    def figures(self) -> dict[str, Any]:
+        """Everything worth keeping of the run."""
+        rendered = self.viewer.frames_rendered if isinstance(self.viewer, HeadlessScreen) else None
+        return self._statistics.figures() | {
+            "skeletons_received": self._channels.skeletons.counts["accepted"],
+            "frames_shown": self._state.frames_shown,
+            "frames_rendered": self._state.frames_shown if rendered is None else rendered,
+            "repository_poses": self._state.repository_poses,
+            "skeleton_bytes": self._channels.subscribers["skeleton"].arrived_bytes if self._channels.subscribers else 0,
+            "bulk_bytes": self._channels.subscribers["bulk"].arrived_bytes if self._channels.subscribers else 0,
+            "dropped": self._dropped(),
+        }

@@ -1,0 +1,169 @@
+"""The receiver on one page: from a skeleton packet to what the viewer shows, and from a candidate pose to its mesh.
+
+DISPOSE Fig. 1, right half: the skeleton never waits for a mesh; it moves the best of those already here.
+"""
+
+from __future__ import annotations
+
+from collections import Counter, deque
+from dataclasses import dataclass
+from statistics import median
+
+import numpy as np
+from numpy.typing import NDArray
+
+from common.body.rigged_mesh import RiggedMesh, build_rigged_mesh
+from common.body.skeleton import Skeleton
+from common.body.skeleton_pose import forward_kinematics
+from common.body.skinning import link_motion
+from common.runtime.clock import Clock
+from common.runtime.stage_timer import StageTimer
+from common.wire.candidate_pose import decode_candidate_pose
+from common.wire.header import WireError
+from common.wire.skeleton_packet import SkeletonPacket
+from receiver.config import RepositorySettings as Settings
+from receiver.repository.pose_repository import PoseRepository, RepositorySettings
+from receiver.repository.pose_selection import PoseSelector, Selection, SelectionSettings
+from receiver.viewer.viewer import ShownFrame
+
+SEARCHES_REMEMBERED = 31  # the median of so many is what a search costs: one that was interrupted says nothing
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ReceivedPose:
+    """A candidate pose meshed, and the sender's run it belongs to."""
+
+    epoch: int
+    mesh: RiggedMesh
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SkeletonToShow:
+    """The newest skeleton with its body, and the poses meshed since the last one (taken out by whoever shows it)."""
+
+    packet: SkeletonPacket
+    body: Skeleton
+    arrived: deque[ReceivedPose]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Shown:
+    """What one skeleton led to. ``frame`` is None when it was withheld: the last good one stays on screen.
+    ``added``, ``removed``: how the repository changed; the viewer follows it. ``counts``: poses not taken, by cause."""
+
+    epoch: int
+    frame: ShownFrame | None
+    added: tuple[RiggedMesh, ...]
+    removed: tuple[int, ...]
+    repository_poses: int
+    counts: Counter[str]
+
+
+def mesh_of(message: bytes, person: int) -> ReceivedPose:
+    """Decode a candidate pose and build its rigged mesh (depth → triangles → links), as the sender did.
+
+    Raises:
+        WireError: it cannot be decoded, is another person's, or holds no surface.
+    """
+    candidate = decode_candidate_pose(message)
+    if candidate.person != person:
+        raise WireError(f"candidate pose of person {candidate.person}, expected {person}")
+    try:
+        mesh = build_rigged_mesh(
+            candidate.pose_id, candidate.capture_ns, candidate.skeleton, candidate.pose, candidate.views
+        )
+    except ValueError as error:
+        raise WireError(str(error)) from error
+    return ReceivedPose(candidate.epoch, mesh)
+
+
+class AnimationPath:
+    """Every skeleton: repository → pose selection by σ → animation. One thread's own."""
+
+    def __init__(self, settings: Settings, timer: StageTimer, clock: Clock) -> None:
+        self._repository = PoseRepository(
+            RepositorySettings(max_poses=settings.poses, max_bytes=settings.megabytes << 20)
+        )
+        self._selector = PoseSelector(SelectionSettings(search=settings.search, hold=settings.hold))
+        self._timer = timer
+        self._clock = clock
+        self._on_screen: int | None = None
+        self._search_ns: deque[int] = deque(maxlen=SEARCHES_REMEMBERED)
+
+    def show(self, newest: SkeletonToShow) -> Shown:
+        """Take in what has arrived, and animate the best pose for the newest skeleton."""
+        packet = newest.packet
+        added: dict[int, RiggedMesh] = {}
+        removed: list[int] = list(self._follow_epoch(packet.epoch))
+        counts: Counter[str] = Counter()
+        with self._timer.stage("repository"):
+            while newest.arrived:
+                self._add(newest.arrived.popleft(), packet.epoch, added, removed, counts)
+        T_world_link = forward_kinematics(newest.body, packet.pose)
+        selection = self._select(T_world_link)
+        removed += self._bound_search()
+        frame = None
+        if selection is None:
+            self._on_screen = None
+            frame = _frame(packet, None, T_world_link, float("nan"))
+        elif not selection.withheld or self._on_screen is None or self._repository.get(self._on_screen) is None:
+            self._on_screen = selection.mesh.pose_id
+            self._repository.count_use(self._on_screen)
+            frame = _frame(packet, selection.mesh, T_world_link, selection.sigma)
+        held = len(self._repository)
+        return Shown(packet.epoch, frame, tuple(added.values()), tuple(removed), held, counts)
+
+    def _select(self, T_world_link: NDArray[np.float32]) -> Selection | None:
+        begin_ns = self._clock.now_ns()
+        selection = self._selector.select(self._repository.by_use(), T_world_link)
+        self._search_ns.append(self._clock.now_ns() - begin_ns)
+        self._timer.add("selection", self._search_ns[-1])
+        return selection
+
+    def _bound_search(self) -> tuple[int, ...]:
+        """Keep no more poses than can be searched in time."""
+        if len(self._search_ns) < SEARCHES_REMEMBERED:
+            return ()
+        pruned = self._repository.limit_search(int(median(self._search_ns)), self._on_screen)
+        if pruned:
+            self._search_ns.clear()
+        return pruned
+
+    def _add(
+        self,
+        pose: ReceivedPose,
+        epoch: int,
+        added: dict[int, RiggedMesh],
+        removed: list[int],
+        counts: Counter[str],
+    ) -> None:
+        if pose.epoch != epoch:  # of a run that is over, or of one whose first skeleton has not come yet
+            counts["pose of another run"] += 1
+            return
+        changes = self._repository.add(pose.mesh, epoch, self._selector.threshold.value, self._on_screen)
+        added[pose.mesh.pose_id] = pose.mesh
+        for pose_id in changes.removed:
+            if added.pop(pose_id, None) is None:
+                removed.append(pose_id)
+
+    def _follow_epoch(self, epoch: int) -> tuple[int, ...]:
+        """Nothing of an old run is shown in a new one."""
+        if epoch == self._repository.epoch:
+            return ()
+        self._on_screen = None
+        return self._repository.reset(epoch)
+
+
+def _frame(
+    packet: SkeletonPacket, mesh: RiggedMesh | None, T_world_link: NDArray[np.float32], sigma: float
+) -> ShownFrame:
+    return ShownFrame(
+        capture_ns=packet.capture_ns,
+        sequence=packet.sequence,
+        pose_id=None if mesh is None else mesh.pose_id,
+        motion=None if mesh is None else link_motion(mesh, T_world_link),
+        joints=np.ascontiguousarray(T_world_link[:, :3, 3]),
+        sigma=sigma,
+        fit_confidence=packet.fit_confidence,
+        confidence=packet.pose.confidence,
+    )

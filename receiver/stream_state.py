@@ -1,0 +1,77 @@
+"""What the receiver knows of its stream now, and the rates a person wants to see beside the picture."""
+
+from __future__ import annotations
+
+from collections import deque
+
+from common.runtime.clock import Clock
+from receiver.viewer.viewer import ConnectionState, ShownFrame, ViewerStatus
+
+LOST_AFTER_NS = 1_000_000_000  # without a skeleton
+RATE_SPAN_NS = 2_000_000_000
+
+
+class StreamState:
+    """Fed by the daemon's loop; ``status`` sums it up for the viewer."""
+
+    def __init__(self, clock: Clock) -> None:
+        self.frame: ShownFrame | None = None
+        self.frames_shown = 0
+        self.repository_poses = 0
+        self._clock = clock
+        self._sender_present = False
+        self._skeleton_ns: int | None = None
+        self._skeletons = 0
+        self._history: deque[tuple[int, int, int, int]] = deque()  # time, skeletons, skeleton bytes, bulk bytes
+
+    def presence(self, there: bool) -> None:
+        """The sender appeared or disappeared."""
+        self._sender_present = there
+
+    def skeleton(self) -> None:
+        """A skeleton to show arrived."""
+        self._skeletons += 1
+        self._skeleton_ns = self._clock.now_ns()
+
+    def shown(self, frame: ShownFrame, repository_poses: int) -> None:
+        """A frame went to the viewer."""
+        self.frame = frame
+        self.frames_shown += 1
+        self.repository_poses = repository_poses
+
+    @property
+    def receiving(self) -> bool:
+        return self._skeleton_ns is not None and self._clock.now_ns() - self._skeleton_ns < LOST_AFTER_NS
+
+    def status(self, age_ms: float | None, skeleton_bytes: int, bulk_bytes: int) -> ViewerStatus:
+        """The figures now. ``skeleton_bytes``, ``bulk_bytes``: arrived in all so far; rates cover two seconds."""
+        now_ns = self._clock.now_ns()
+        self._history.append((now_ns, self._skeletons, skeleton_bytes, bulk_bytes))
+        while now_ns - self._history[0][0] > RATE_SPAN_NS:
+            self._history.popleft()
+        then_ns, skeletons, then_skeleton_bytes, then_bulk_bytes = self._history[0]
+        span_s = max((now_ns - then_ns) / 1e9, 1e-3)
+        connection, detail = self._connection()
+        frame = self.frame
+        has_pose = frame is not None and frame.pose_id is not None
+        return ViewerStatus(
+            connection=connection,
+            detail=detail,
+            frame_rate_hz=(self._skeletons - skeletons) / span_s,
+            pose_age_ms=age_ms,
+            skeleton_bps=8 * (skeleton_bytes - then_skeleton_bytes) / span_s,
+            bulk_bps=8 * (bulk_bytes - then_bulk_bytes) / span_s,
+            repository_poses=self.repository_poses,
+            chosen_pose=frame.pose_id if frame is not None else None,
+            sigma=frame.sigma if frame is not None and has_pose else None,
+        )
+
+    def _connection(self) -> tuple[ConnectionState, str]:
+        if self.receiving:
+            waiting = self.frame is None or self.frame.pose_id is None
+            return ConnectionState.RECEIVING, "skeleton only, the first mesh is on its way" if waiting else ""
+        if self._sender_present:
+            return ConnectionState.WAITING, "the sender is there, but nobody is in view yet"
+        if self._skeleton_ns is None:
+            return ConnectionState.WAITING, ""
+        return ConnectionState.LOST, ""

@@ -1,0 +1,74 @@
+"""A viewer that renders into arrays: what a person at the other end sees, for headless runs and benches."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from common.body.skinning import animate_rigid
+from common.geometry.camera_model import Camera
+from common.geometry.rasterizer import render
+from receiver.viewer.viewer import ShownFrame, ViewerStatus
+
+if TYPE_CHECKING:
+    from common.body.rigged_mesh import RiggedMesh
+
+BACKGROUND = 255
+
+
+class OffscreenViewer:
+    """Keeps the poses and the newest frame, as a page does, and renders them when asked.
+
+    ``frames_shown`` counts the frames whose pose was there; ``status`` is the newest one.
+    """
+
+    def __init__(self) -> None:
+        self._poses: dict[int, RiggedMesh] = {}
+        self._frame: ShownFrame | None = None
+        self.frames_shown = 0
+        self.status = ViewerStatus()
+
+    @property
+    def frame(self) -> ShownFrame | None:
+        """The frame on screen; None before the first whose pose is here."""
+        return self._frame
+
+    def add_pose(self, mesh: RiggedMesh) -> None:
+        """Keeps the mesh until it is removed."""
+        self._poses[mesh.pose_id] = mesh
+
+    def remove_pose(self, pose_id: int) -> None:
+        """Forgets the mesh; a frame that shows it goes off the screen."""
+        self._poses.pop(pose_id, None)
+        if self._frame is not None and self._frame.pose_id == pose_id:
+            self._frame = None
+
+    def show(self, frame: ShownFrame) -> None:
+        """The frame to render from now on; without a known pose the last one stays."""
+        if frame.pose_id in self._poses:
+            self._frame = frame
+            self.frames_shown += 1
+
+    def set_status(self, status: ViewerStatus) -> None:
+        """Keeps the newest figures."""
+        self.status = status
+
+    def render(self, cameras: Sequence[Camera]) -> list[tuple[NDArray[np.uint8], NDArray[np.float32]]]:
+        """The frame on screen seen by each camera: colour (H, W, 3) uint8 RGB on white, depth (H, W) float32 [m].
+
+        Depth 0 = nothing there, which is everywhere while nobody is shown.
+        """
+        frame = self._frame
+        if frame is None or frame.pose_id is None or frame.motion is None:
+            return [_nobody(camera) for camera in cameras]
+        mesh = self._poses[frame.pose_id]
+        vertices = animate_rigid(mesh, frame.motion)
+        return [render(vertices, mesh.faces_drawn, mesh.mesh.colours, camera, BACKGROUND) for camera in cameras]
+
+
+def _nobody(camera: Camera) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
+    size = (camera.height, camera.width)
+    return np.full((*size, 3), BACKGROUND, np.uint8), np.zeros(size, np.float32)

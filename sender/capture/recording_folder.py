@@ -1,0 +1,254 @@
+"""Recordings as folders of images: our own format (docs/recordings.md) and a decoded Depthkit clip.
+
+Per camera a folder with ``depth/NNNNNN.png`` (16 bit, mm, 0 = no reading) and ``color/NNNNNN.png`` or ``.jpg``;
+one JSON file says the rest.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from common.geometry.camera_model import Camera
+from sender.capture.assumed_pose import assumed_pose
+from sender.capture.camera_record import camera_from_record, camera_to_record
+from sender.capture.frame_set import CaptureError, DepthFrame
+
+FORMAT, VERSION = "telepose recording", 1
+_LOOKED_AT = 10  # frames that an unknown camera pose is estimated from
+
+
+@dataclass(frozen=True, slots=True)
+class _CameraFolder:
+    """The images of one camera; ``near_mm``, ``far_mm``: other readings are cut."""
+
+    camera: Camera
+    folder: Path
+    near_mm: int
+    far_mm: int
+
+    def numbers(self) -> list[int]:
+        """The frames there are, in order."""
+        files = [file for file in (self.folder / "depth").glob("*.png") if file.stem.isdigit()]
+        if not files:
+            raise CaptureError(f"{self.folder / 'depth'}: no frames NNNNNN.png")
+        return sorted(int(file.stem) for file in files)
+
+    def load(self, number: int) -> tuple[NDArray[np.uint16], NDArray[np.uint8] | None]:
+        """Depth with cut and mask applied, and colour where there is one."""
+        depth = read_depth(_numbered(self.folder / "depth", number, ".png"), self.camera)
+        depth[(depth < self.near_mm) | (depth > self.far_mm)] = 0
+        mask = _find(self.folder / "mask", number)
+        if mask is not None:
+            depth[_read(mask, cv2.IMREAD_GRAYSCALE, self.camera) < 128] = 0
+        colour = _find(self.folder / "color", number)
+        if colour is None:
+            return depth, None
+        return depth, cv2.cvtColor(_read(colour, cv2.IMREAD_COLOR, self.camera), cv2.COLOR_BGR2RGB).astype(np.uint8)
+
+
+class RecordingFolder:
+    """A recording in our own format.
+
+    Raises:
+        CaptureError: recording.json or the folders are not as docs/recordings.md says.
+    """
+
+    def __init__(self, path: Path) -> None:
+        file = path / "recording.json"
+        content = _read_json(file)
+        try:
+            if content["format"] != FORMAT or content["version"] != VERSION:
+                raise ValueError(f"not {FORMAT!r} version {VERSION}")
+            self.frame_rate_hz = _frame_rate(content["frame_rate_hz"])
+            self._folders = [_camera_folder(path, record) for record in content["cameras"]]
+            if not self._folders:
+                raise ValueError("no cameras")
+            self.cameras = tuple(folder.camera for folder in self._folders)
+            self.empty_room = tuple(_empty_room(path, record, self.cameras) for record in content["cameras"])
+            times = [_times(f, r, self.frame_rate_hz) for f, r in zip(self._folders, content["cameras"], strict=True)]
+        except KeyError as error:
+            raise CaptureError(f"{file}: {error} is missing") from None
+        except (ValueError, TypeError) as error:
+            raise CaptureError(f"{file}: {error}") from None
+        self.frames = _index(times)
+
+    def load(self, camera_index: int, number: int) -> tuple[NDArray[np.uint16], NDArray[np.uint8] | None]:
+        """See ``recorded_rig.Recording``."""
+        return self._folders[camera_index].load(number)
+
+
+class DepthkitFolder:
+    """A decoded Depthkit clip of one camera: intrinsics.json, color/, depth/; its pose is assumed.
+
+    Raises:
+        CaptureError: a field or the frames are missing.
+    """
+
+    def __init__(self, path: Path) -> None:
+        file = path / "intrinsics.json"
+        content = _read_json(file)
+        try:
+            record = {"name": path.name, "T_world_camera": np.eye(4), **content}
+            if not np.isclose(float(content.get("depth_unit_m", 0.001)), 0.001):
+                raise ValueError("depth_unit_m is not 0.001")
+            self.frame_rate_hz = _frame_rate(content["fps"])
+            folder = _camera_folder(path, record | {"folder": "."})
+            numbers = folder.numbers()
+            looked_at = [folder.load(number)[0] for number in numbers[:: max(len(numbers) // _LOOKED_AT, 1)]]
+            camera = folder.camera
+            pose = assumed_pose(looked_at, camera.fx, camera.fy, camera.cx, camera.cy)
+            self.cameras: tuple[Camera, ...] = (camera_from_record(record | {"T_world_camera": pose}),)
+        except KeyError as error:
+            raise CaptureError(f"{file}: {error} is missing") from None
+        except (ValueError, TypeError) as error:
+            raise CaptureError(f"{file}: {error}") from None
+        self._folder = folder
+        self.empty_room: tuple[NDArray[np.uint16] | None, ...] = (None,)
+        self.frames = _index([{n: round((n - numbers[0]) * 1e9 / self.frame_rate_hz) for n in numbers}])
+
+    def load(self, camera_index: int, number: int) -> tuple[NDArray[np.uint16], NDArray[np.uint8] | None]:
+        """See ``recorded_rig.Recording``."""
+        return self._folder.load(number)
+
+
+def write_recording(
+    path: Path,
+    cameras: Sequence[Camera],
+    frames: Iterable[DepthFrame],
+    frame_rate_hz: float,
+    empty_room: Sequence[NDArray[np.uint16] | None] = (),
+) -> None:
+    """Write frames as a recording in our format into the new or empty folder ``path``; times are kept.
+
+    Raises:
+        CaptureError: the folder is not empty or cannot be written.
+    """
+    if path.exists() and any(path.iterdir()):
+        raise CaptureError(f"{path}: not empty")
+    records: list[dict[str, Any]] = []
+    for index, camera in enumerate(cameras):
+        records.append({**camera_to_record(camera), "folder": camera.name, "timestamps_ns": {}})
+        if index < len(empty_room) and empty_room[index] is not None:
+            records[-1]["empty_room"] = f"{camera.name}/empty_room.png"
+            _write(path / records[-1]["empty_room"], empty_room[index])
+    start_ns: int | None = None
+    for frame in frames:
+        start_ns = frame.capture_ns if start_ns is None else start_ns
+        record = records[frame.camera_index]
+        record["timestamps_ns"][str(frame.sequence)] = frame.capture_ns - start_ns
+        _write(path / record["folder"] / "depth" / f"{frame.sequence:06d}.png", frame.depth_mm)
+        if frame.colour is not None:
+            colour = cv2.cvtColor(frame.colour, cv2.COLOR_RGB2BGR)
+            _write(path / record["folder"] / "color" / f"{frame.sequence:06d}.png", colour)
+    content = {"format": FORMAT, "version": VERSION, "frame_rate_hz": frame_rate_hz, "cameras": records}
+    (path / "recording.json").write_text(json.dumps(content, indent=1))
+
+
+def read_depth(file: Path, camera: Camera) -> NDArray[np.uint16]:
+    """A depth image (H, W) uint16 [mm] of the camera's size.
+
+    Raises:
+        CaptureError: missing, corrupt, of another kind or size.
+    """
+    image = _read(file, cv2.IMREAD_UNCHANGED, camera)
+    if image.dtype != np.uint16 or image.ndim != 2:
+        raise CaptureError(f"{file}: {image.dtype} with {image.ndim} axes, not a 16-bit grey image")
+    return image.astype(np.uint16, copy=False)
+
+
+def _read_json(file: Path) -> dict[str, Any]:
+    try:
+        content = json.loads(file.read_text())
+    except (OSError, ValueError) as error:
+        raise CaptureError(f"{file}: {error}") from None
+    if not isinstance(content, dict):
+        raise CaptureError(f"{file}: not a JSON object")
+    return content
+
+
+def _frame_rate(value: Any) -> float:
+    rate = float(value)
+    if not 0.1 <= rate <= 1000:
+        raise ValueError(f"frame rate {rate} Hz")
+    return rate
+
+
+def _camera_folder(path: Path, record: dict[str, Any]) -> _CameraFolder:
+    camera = camera_from_record(record)
+    folder = _inside(path, record.get("folder", camera.name))
+    if not (folder / "depth").is_dir():
+        raise CaptureError(f"{folder}: no folder depth/ of camera {camera.name}")
+    near_mm = round(1000 * float(record.get("near_m") or 0))
+    return _CameraFolder(camera, folder, near_mm, round(1000 * float(record.get("far_m") or 65.535)))
+
+
+def _empty_room(path: Path, record: dict[str, Any], cameras: Sequence[Camera]) -> NDArray[np.uint16] | None:
+    name = record.get("empty_room")
+    if name is None:
+        return None
+    return read_depth(_inside(path, name), next(camera for camera in cameras if camera.name == record["name"]))
+
+
+def _times(folder: _CameraFolder, record: dict[str, Any], rate_hz: float) -> dict[int, int]:
+    """Capture time [ns] after the start by frame number."""
+    numbers = folder.numbers()
+    stamps = record.get("timestamps_ns")
+    if stamps is None:
+        return {number: round(number * 1e9 / rate_hz) for number in numbers}
+    if not isinstance(stamps, dict):
+        raise ValueError(f"camera {folder.camera.name}: timestamps_ns is not an object of frame number: time")
+    without = [number for number in numbers if str(number) not in stamps]
+    if without:
+        raise ValueError(f"camera {folder.camera.name}: no timestamp for frame {without[0]}")
+    return {number: int(stamps[str(number)]) for number in numbers}
+
+
+def _index(times: Sequence[dict[int, int]]) -> tuple[tuple[int, int, int], ...]:
+    """(time [ns] from the first frame, camera, number) of all frames, in order."""
+    frames = sorted((time, camera, number) for camera, of in enumerate(times) for number, time in of.items())
+    return tuple((time - frames[0][0], camera, number) for time, camera, number in frames)
+
+
+def _inside(path: Path, name: Any) -> Path:
+    """A path below ``path``: a recording from elsewhere must not name files outside its folder."""
+    file = path / str(name)
+    if not file.resolve().is_relative_to(path.resolve()):
+        raise ValueError(f"{name!r} lies outside the recording")
+    return file
+
+
+def _numbered(folder: Path, number: int, suffix: str) -> Path:
+    """The file of a frame: six digits, or four as Depthkit's."""
+    six = folder / f"{number:06d}{suffix}"
+    return six if six.exists() else folder / f"{number:04d}{suffix}"
+
+
+def _find(folder: Path, number: int) -> Path | None:
+    files = (_numbered(folder, number, suffix) for suffix in (".png", ".jpg"))
+    return next((file for file in files if file.exists()), None)
+
+
+def _read(file: Path, flags: int, camera: Camera) -> NDArray[Any]:
+    try:
+        image = cv2.imread(str(file), flags)
+    except cv2.error as error:
+        raise CaptureError(f"{file}: {error}") from None
+    if image is None:
+        raise CaptureError(f"{file}: cannot be decoded")
+    if image.shape[:2] != (camera.height, camera.width):
+        raise CaptureError(f"{file}: {image.shape[1]}×{image.shape[0]}, not {camera.width}×{camera.height}")
+    return image
+
+
+def _write(file: Path, image: Any) -> None:
+    file.parent.mkdir(parents=True, exist_ok=True)
+    if not cv2.imwrite(str(file), image):
+        raise CaptureError(f"{file}: cannot be written")

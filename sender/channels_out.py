@@ -1,0 +1,59 @@
+"""What the sender declares with Zenoh: its publishers, its answers to questions, its presence."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable
+
+from common.runtime.clock import Clock
+from common.transport import channels
+from common.transport.channel_publisher import ChannelPublisher
+from common.transport.channel_query import ChannelQueryable
+from common.transport.channel_subscriber import Arrival, ChannelSubscriber
+from common.transport.channels import ANY, Channel, channel_key
+from common.transport.zenoh_session import ZenohSession
+
+CLOCK_ANSWER = struct.Struct("<q")  # the sender's monotonic time [ns]
+
+
+class SenderChannels:
+    """One person's outgoing stream. ``body`` is kept for receivers that ask."""
+
+    def __init__(self, session: ZenohSession, site: str, person: int, clock: Clock) -> None:
+        self._session = session
+        self._site = site
+        self._person = person
+        self._clock = clock
+        self._skeleton = ChannelPublisher(session, channels.SKELETON, self._key(channels.SKELETON))
+        self._body = ChannelPublisher(session, channels.BODY, self._key(channels.BODY))
+        self._body_message: bytes | None = None
+        self.reports: ChannelSubscriber | None = None
+
+    def open(self, on_report: Callable[[Arrival], None], status: Callable[[], bytes]) -> None:
+        """Answer questions, listen to reports, and be seen."""
+        session = self._session
+        ChannelQueryable(session, channels.BODY, self._key(channels.BODY), lambda _: self._body_message)
+        ChannelQueryable(session, channels.STATUS, self._key(channels.STATUS), lambda _: status())
+        ChannelQueryable(session, channels.CLOCK, self._key(channels.CLOCK), self._tell_time)
+        key = self._key(channels.REPORT, ANY)
+        self.reports = ChannelSubscriber(session, channels.REPORT, key, on_report, self._clock)
+        session.declare_presence(self._key(channels.SENDER_PRESENCE))
+
+    def publish_body(self, message: bytes) -> None:
+        """Tell everyone the person's sizes, and keep them for those who come later."""
+        self._body_message = message
+        self._body.put(message)
+
+    def publish_skeleton(self, packet: bytes) -> None:
+        """One frame, to everyone at once."""
+        self._skeleton.put(packet)
+
+    def bulk_publisher(self, receiver: str) -> ChannelPublisher:
+        """The bulk channel of one receiver."""
+        return ChannelPublisher(self._session, channels.BULK, self._key(channels.BULK, receiver))
+
+    def _tell_time(self, _: bytes) -> bytes:
+        return CLOCK_ANSWER.pack(self._clock.now_ns())
+
+    def _key(self, channel: Channel, receiver: str | None = None) -> str:
+        return channel_key(channel, self._site, self._person, receiver)

@@ -1,0 +1,249 @@
+"""The sender daemon: cameras in, skeletons and candidate poses out.
+
+The capture thread feeds the fitting thread (newest set wins), whose result the loop publishes at once. The loop hands
+some frames on to the candidate thread, and what that finds to the mesh scheduler. Nothing queues.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import secrets
+from typing import Any
+
+from common.runtime.clock import MonotonicClock
+from common.runtime.compute_worker import ComputeWorker
+from common.runtime.daemon import Daemon, DaemonError
+from common.runtime.metrics import Health, Metrics, daemon_app, serve_app
+from common.runtime.run_statistics import RunStatistics, write_statistics
+from common.runtime.stage_timer import StageTimer
+from common.transport.zenoh_session import ZenohSession, open_session, with_endpoints
+from sender.body_store import BodyStore
+from sender.candidate_poses.mesh_scheduler import MeshScheduler, SendRecord
+from sender.capture.capture_thread import CaptureThread
+from sender.capture.frame_set import CaptureError, FrameSet, FrameSource
+from sender.capture.open_source import open_source
+from sender.capture.synchronizer import Synchronizer
+from sender.capture.virtual_rig import VirtualRig
+from sender.channels_out import SenderChannels
+from sender.config import SenderSettings
+from sender.fitting.gauss_newton_tracker import GaussNewtonSettings, GaussNewtonTracker
+from sender.pipeline import CandidatePath, Candidates, SkeletonPath, StreamIdentity, TrackedFrame
+from sender.receiver_links import ReceiverLinks
+from sender.reconstruction.background import BackgroundModel
+from sender.reconstruction.foreground_points import PointSampler
+
+log = logging.getLogger(__name__)
+
+FIRST_SAVE_NS = 3_000_000_000  # after the first skeleton: by then the body has been seen from all sides
+SAVE_EVERY_NS = 30_000_000_000
+LAST_WORDS_S = 0.5  # after the last frame of a recording, for what is still on its way
+
+
+class SenderDaemon:
+    """Runs until its source ends or it is stopped."""
+
+    def __init__(self, settings: SenderSettings) -> None:
+        self._settings = settings
+        self._clock = MonotonicClock()
+        self._health = Health()
+
+    async def run(self, daemon: Daemon) -> None:
+        """The daemon's main coroutine.
+
+        Raises:
+            DaemonError: a camera, port or file that cannot be used; the message says which.
+        """
+        settings = self._settings
+        store = BodyStore(settings.state_folder, settings.site, settings.person)
+        async with open_session(with_endpoints(settings.link, "sender")) as session:
+            try:
+                source = await asyncio.to_thread(open_source, settings.capture)
+                try:
+                    await self._run_with(source, session, store, daemon)
+                finally:
+                    await asyncio.to_thread(source.close)
+            except CaptureError as error:
+                raise DaemonError(str(error)) from error
+
+    async def _run_with(self, source: FrameSource, session: ZenohSession, store: BodyStore, daemon: Daemon) -> None:
+        stream = _Stream(self._settings, source, session, store, self._clock, self._health)
+        app = daemon_app(stream.metrics, self._health)
+        http = self._settings.http
+        try:
+            async with serve_app(app, http.host, http.port) as port:
+                log.info("metrics on http://%s:%d/metrics", http.host, port)
+                await stream.run(daemon)
+        except OSError as error:
+            raise DaemonError(f"http: {error}") from error
+        finally:
+            if self._settings.stats_file is not None:
+                write_statistics(self._settings.stats_file, stream.figures())
+
+
+class _Stream:
+    """One run over one open source."""
+
+    def __init__(
+        self,
+        settings: SenderSettings,
+        source: FrameSource,
+        session: ZenohSession,
+        store: BodyStore,
+        clock: MonotonicClock,
+        health: Health,
+    ) -> None:
+        self._settings = settings
+        self._source = source
+        self._store = store
+        self._clock = clock
+        self._health = health
+        self._timer = StageTimer(clock)
+        self._statistics = RunStatistics(self._timer)
+        identity = StreamIdentity(settings.person, secrets.randbits(32))
+        self._tracker = GaussNewtonTracker(GaussNewtonSettings(), store.load())
+        self._skeletons = self._skeleton_path(identity)
+        self._candidates = CandidatePath(identity, settings.poses, self._timer)
+        self._scheduler = MeshScheduler()
+        self._channels = SenderChannels(session, settings.site, settings.person, clock)
+        self._links = ReceiverLinks(
+            identity.epoch, self._scheduler, self._channels.bulk_publisher, self._on_sent, clock
+        )
+        self._fitting = ComputeWorker("fitting", self._fit, self._on_tracked)
+        self._meshing = ComputeWorker("candidates", self._candidates.process, self._on_candidates)
+        self._synchronizer = self._make_synchronizer()
+        self._capture = CaptureThread(source, self._synchronizer, self._fitting.submit, clock)
+        self._last_status = ""
+        self._next_save_ns: int | None = None
+        self._next_candidate_ns = 0
+        self._published = 0
+        self._poses_sent = 0
+        self._skeleton_bytes_max = 0
+        self._candidate_bytes: list[int] = []
+        self.metrics = self._make_metrics()
+
+    def _skeleton_path(self, identity: StreamIdentity) -> SkeletonPath:
+        source, settings = self._source, self._settings
+        rooms = zip(source.cameras, source.empty_room, strict=True)
+        return SkeletonPath(
+            identity,
+            [BackgroundModel(camera, room) for camera, room in rooms],
+            PointSampler(source.cameras, settings.tracking.points),
+            self._tracker,
+            source.frame_rate_hz,
+            self._timer,
+        )
+
+    def _make_synchronizer(self) -> Synchronizer:
+        cameras = self._source.cameras
+        half_a_frame_ns = int(0.5e9 / self._source.frame_rate_hz)
+        patience_ns = int(self._settings.capture.patience_ms * 1e6)
+        shapes = [(camera.height, camera.width) for camera in cameras]
+        return Synchronizer(len(cameras), half_a_frame_ns, patience_ns, shapes)
+
+    async def run(self, daemon: Daemon) -> None:
+        """Capture, fit, publish until the source ends."""
+        self._channels.open(self._links.on_report, self.metrics.text)
+        async with asyncio.TaskGroup() as group:
+            lasting = [group.create_task(part.run()) for part in (self._fitting, self._meshing, self._links)]
+            await asyncio.gather(self._fitting.wait_ready(), self._meshing.wait_ready())
+            self._health.ready, self._health.reason = True, "capturing"
+            daemon.announce_ready()
+            await self._capture.run()
+            await asyncio.sleep(LAST_WORDS_S)
+            for task in lasting:
+                task.cancel()
+
+    def _fit(self, frames: FrameSet) -> TrackedFrame:
+        """On the fitting thread. The body is saved from here, since only this thread may read the tracker."""
+        tracked = self._skeletons.process(frames)
+        if tracked.packet is not None:
+            if self._next_save_ns is None:
+                self._next_save_ns = frames.capture_ns + FIRST_SAVE_NS
+            if frames.capture_ns >= self._next_save_ns and self._tracker.body is not None:
+                self._next_save_ns = frames.capture_ns + SAVE_EVERY_NS
+                with self._timer.stage("body file"):
+                    self._store.save(self._tracker.body.to_bytes())
+        return tracked
+
+    def _on_tracked(self, tracked: TrackedFrame) -> None:
+        """On the loop, for every frame: publish, and hand some frames on."""
+        self._tell_status()
+        if tracked.body is not None:
+            self._channels.publish_body(tracked.body)
+        if tracked.packet is None:
+            return
+        self._channels.publish_skeleton(tracked.packet)
+        self._published += 1
+        self._skeleton_bytes_max = max(self._skeleton_bytes_max, len(tracked.packet))
+        self._timer.add("capture to publish", self._clock.now_ns() - tracked.capture_ns)
+        if self._settings.poses.enabled:
+            self._candidates.remember(tracked)
+            if tracked.capture_ns >= self._next_candidate_ns and self._candidates.may_become_one(tracked):
+                self._next_candidate_ns = tracked.capture_ns + int(self._settings.poses.interval_ms * 1e6)
+                self._meshing.submit(tracked)
+
+    def _on_candidates(self, found: Candidates) -> None:
+        """On the loop: what may be sent now."""
+        self._scheduler.offer(found.pose_id, found.encoded, found.capture_ns, found.chi.get(found.pose_id, 0.0))
+        self._scheduler.update(found.chi, found.retained)
+        self._candidate_bytes.append(len(found.encoded))
+        self._links.wake()
+
+    def _on_sent(self, record: SendRecord) -> None:
+        """On the loop: a pose is on its way to a receiver."""
+        self._poses_sent += 1
+        self._candidates.note_sent(record.pose_id, record.retain_threshold)
+        log.debug("send %s", record)
+
+    def _tell_status(self) -> None:
+        if self._tracker.status != self._last_status:
+            self._last_status = self._tracker.status
+            log.info("tracker: %s", self._last_status)
+
+    def _make_metrics(self) -> Metrics:
+        metrics = Metrics()
+        metrics.stages(self._timer)
+        metrics.counter("frames_captured_total", "Depth frames read, all cameras", lambda: self._capture.frames)
+        metrics.counter("frame_sets_total", "Synchronised sets", lambda: self._capture.sets)
+        metrics.counter("skeletons_published_total", "Skeleton packets published", lambda: self._published)
+        metrics.counter("candidate_poses_sent_total", "Deliveries", lambda: self._poses_sent)
+        metrics.counter("dropped_total", "What was dropped, by cause", self._dropped)
+        metrics.gauge("receivers", "Receivers there are", lambda: len(self._links.links))
+        return metrics
+
+    def _dropped(self) -> dict[str, float]:
+        late = self._synchronizer.counters
+        reports = self._channels.reports
+        return {
+            "fitting busy": self._fitting.dropped,
+            "candidates busy": self._meshing.dropped,
+            "camera missing": late.missing,
+            "frame late": late.late,
+            "frame duplicate": late.duplicate,
+            "frame rejected": late.rejected,
+            "frame lost by reader": getattr(self._source, "lost", 0) + getattr(self._source, "dropped", 0),
+            "receiver refused": self._links.counts["refused"],
+            **({f"report {cause}": count for cause, count in reports.counts.items()} if reports else {}),
+        }
+
+    def figures(self) -> dict[str, Any]:
+        """Everything worth keeping of the run."""
+        sizes = self._candidate_bytes
+        rig = self._source if isinstance(self._source, VirtualRig) else None
+        rig_elapsed_s = (self._clock.now_ns() - rig.epoch_ns) / 1e9 if rig else 0.0
+        return self._statistics.figures() | {
+            "frames_captured": self._capture.sets,
+            "camera_frames": self._capture.frames,
+            "skeletons_published": self._published,
+            "skeleton_bytes_max": self._skeleton_bytes_max,
+            "candidate_poses_considered": len(sizes),
+            "candidate_poses_sent": self._poses_sent,
+            "candidate_poses_delivered": self._links.delivered_poses,
+            "candidate_pose_bytes_mean": sum(sizes) / len(sizes) if sizes else 0,
+            "receivers": dict(self._links.counts),
+            "dropped": self._dropped(),
+            "rig_epoch_ns": rig.epoch_ns if rig else None,
+            "rig_cpu_share": rig.status.get("cpu_s", 0.0) / max(rig_elapsed_s, 1e-3) if rig else None,
+            "rig": rig.status if rig else None,
+        }

@@ -1,0 +1,279 @@
+"""The default pose tracker: finds a person, learns their surface, follows them with Gauss–Newton (algorithms.md §3, §8).
+
+Looking → building (the first second after the start pose: the surface is gathered) → tracking → looking again after
+the person was lost for a while. Everything depends only on the clouds and their capture times.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from common.body.skeleton import LINK_COUNT, LINK_INDEX, Skeleton
+from common.body.skeleton_pose import SkeletonPose, forward_kinematics
+from common.geometry import quaternion
+from common.geometry.point_cloud import PointCloud
+from sender.fitting.articulated_gauss_newton import FitArrays, PoseState, Schedule, fit_pose, forward, judge_pose
+from sender.fitting.body_model import BodyModel
+from sender.fitting.initial_pose import NoPose, find_initial_pose
+from sender.fitting.joint_limits import joint_table
+from sender.fitting.limb_search import Limb, limbs, nearby_poses, score_poses, with_limb
+from sender.fitting.tracker import FitResult
+from sender.fitting.whole_body_search import WholeBodySearch
+
+Array = NDArray[Any]
+
+FRAME_NS = 1e9 / 30.0
+MINIMUM_POINTS = 40
+
+
+@dataclass(frozen=True, slots=True)
+class GaussNewtonSettings:
+    """``building_s``: how long the surface is gathered after the start pose. ``good_score``, ``lost_score``: mean robust
+    cost per point (0..1) below which a pose is trusted, and above which the person counts as lost; ``lost_s``: for this
+    long before looking again."""
+
+    building_s: float = 1.0
+    good_score: float = 0.16
+    lost_score: float = 0.35
+    lost_s: float = 1.0
+
+
+HYPOTHESES = (1.0, 0.5, 0.0)  # shares of the last velocity
+GUESS = Schedule(3, 0.20, 0.10, 0.2, 1.0, 1.0)
+COARSE = Schedule(2, 0.15, 0.08, 0.1, 1.0, 1.0)
+FINE = Schedule(2, 0.08, 0.06, 0.1, 1.0, 1.0)
+LIMB = Schedule(5, 0.12, 0.06, 0.1, 3.0, 1.0)
+LEARN_EVERY = 3
+RETRY_FRAMES = 5  # after a limb search in vain
+_FOLLOWS = {"fingers": "hand", "toes": "foot"}
+
+
+class GaussNewtonTracker:
+    """Implements ``Tracker``. ``body``: a person seen before, then no start pose is needed."""
+
+    def __init__(self, settings: GaussNewtonSettings, body: BodyModel | None = None) -> None:
+        self._settings = settings
+        self._table = joint_table()
+        self._limbs = limbs(self._table)
+        self._body = body
+        self._search: WholeBodySearch | None = None if body is None else WholeBodySearch(body, self._table)
+        self._state: PoseState | None = None
+        self._before: PoseState | None = None  # the frame before: velocity
+        self._times_ns = (0, 0)  # of the state and of the frame before
+        self._usual = np.zeros(LINK_COUNT)  # share of the cloud each link usually explains
+        self._result: FitResult | None = None
+        self._building_until_ns: int | None = None
+        self._good_ns = 0
+        self.searches = 0
+        self._frames = 0
+        self._retry_after = np.zeros(LINK_COUNT, np.int64)
+        self._status = "looking for a person"
+
+    @property
+    def status(self) -> str:
+        """What the tracker is doing, or why there is no pose yet, for the operator."""
+        return self._status
+
+    @property
+    def body(self) -> BodyModel | None:
+        """The person's model once one was found; worth saving when the status is "tracking"."""
+        return self._body
+
+    def start_from(self, skeleton: Skeleton, pose: SkeletonPose, cloud: PointCloud, capture_ns: int) -> FitResult:
+        """Starts with sizes and pose known from elsewhere (a recording's own joints) and the cloud they belong to."""
+        self._body = BodyModel(skeleton)
+        self._search = WholeBodySearch(self._body, self._table)
+        self._body.add(cloud, forward_kinematics(skeleton, pose))
+        self._state = self._before = _state_of(pose)
+        self._times_ns = (capture_ns, capture_ns)
+        self._building_until_ns = capture_ns + int(self._settings.building_s * 1e9)
+        self._good_ns = capture_ns
+        fit = self._judge(cloud, self._state)
+        return self._accept(fit, cloud, capture_ns)
+
+    def track(self, cloud: PointCloud, capture_ns: int) -> FitResult | None:
+        """The pose in ``cloud``; with too few points the last pose at confidence 0, or None before the start."""
+        if len(cloud) < MINIMUM_POINTS:
+            self._status = f"{len(cloud)} points: nobody to see"
+            return self._unseen()
+        self._frames += 1
+        if self._state is None:
+            return self._look(cloud, capture_ns)
+        fit = self._follow(cloud, capture_ns)
+        if fit.score < self._settings.lost_score:
+            self._good_ns = capture_ns
+        elif capture_ns - self._good_ns > self._settings.lost_s * 1e9:
+            self._state = None
+            self._status = "lost: looking for the person"
+            return self._unseen()
+        return self._accept(fit, cloud, capture_ns)
+
+    def _look(self, cloud: PointCloud, capture_ns: int) -> FitResult | None:
+        if self._body is None:
+            found = find_initial_pose(cloud)
+            if isinstance(found, NoPose):
+                self._status = f"looking for a person: {found.reason}"
+                return None
+            return self.start_from(found.skeleton, found.pose, cloud, capture_ns)
+        assert self._search is not None
+        fit = self._search.step(cloud)
+        if fit.score > self._settings.good_score:
+            self._status = f"looking for the known person: best score {fit.score:.2f}"
+            return self._unseen()
+        self._state = self._before = fit.pose
+        self._times_ns = (capture_ns, capture_ns)
+        self._good_ns = capture_ns
+        self._search = WholeBodySearch(self._body, self._table)
+        return self._accept(self._judge(cloud, fit.pose), cloud, capture_ns)
+
+    def _follow(self, cloud: PointCloud, capture_ns: int) -> FitArrays:
+        """Velocity hypotheses on a tenth of the points, coarse then fine fit of the best, limbs that got lost."""
+        some = _every(cloud, max(len(cloud) // 250, 1))
+        guesses = [self._predicted(share, capture_ns) for share in HYPOTHESES]
+        fits = [self._fit(some, guess, guess, GUESS) for guess in guesses]
+        best = min(range(len(fits)), key=lambda k: fits[k].score)
+        predicted = guesses[best]
+        fit = self._fit(_every(cloud, 3), fits[best].pose, predicted, COARSE)
+        fit = self._fit(cloud, fit.pose, predicted, FINE)
+        for limb in self._limbs:
+            fit = self._search_limb(limb, fit, cloud)
+        return fit
+
+    def _predicted(self, share: float, capture_ns: int) -> PoseState:
+        """The state moved on at ``share`` of its velocity, scaled to the time passed; twists stay: a straight limb does
+        not show its twist, so its velocity is noise."""
+        assert self._state is not None and self._before is not None
+        now, before = self._state, self._before
+        past_ns = self._times_ns[0] - self._times_ns[1]
+        if share == 0.0 or past_ns <= 0:
+            return now
+        ahead = share * min((capture_ns - self._times_ns[0]) / past_ns, 3.0)
+        turn = quaternion.to_rotation_vector(quaternion.from_matrix(np.swapaxes(before.local, 1, 2) @ now.local))
+        turn[np.arange(1, LINK_COUNT), self._table.twist_axis[1:]] = 0.0
+        step = quaternion.to_matrix(quaternion.from_rotation_vector(ahead * turn))
+        return PoseState(now.root + ahead * (now.root - before.root), now.local @ step)
+
+    def _fit(self, cloud: PointCloud, start: PoseState, predicted: PoseState, plan: Schedule) -> FitArrays:
+        body = self._known_body()
+        offsets = body.skeleton.offsets.astype(np.float64)
+        return fit_pose(cloud.positions, cloud.normals, start, predicted, offsets, body.surface(0), self._table, plan)
+
+    def _judge(self, cloud: PointCloud, state: PoseState) -> FitArrays:
+        body = self._known_body()
+        offsets = body.skeleton.offsets.astype(np.float64)
+        return judge_pose(cloud.positions, cloud.normals, state, offsets, body.surface(0), self._table)
+
+    def _known_body(self) -> BodyModel:
+        assert self._body is not None
+        return self._body
+
+    def _search_limb(self, limb: Limb, fit: FitArrays, cloud: PointCloud) -> FitArrays:
+        """The best of the fit and its retries with the limb as it was, turned, or anywhere; tried when the limb explains
+        much less than usual while points it could explain are left over."""
+        assert self._state is not None
+        outer = limb.links[1:]
+        usual = self._usual[outer].sum() * len(cloud)
+        if fit.explained[outer].sum() > 0.4 * usual or self._frames < self._retry_after[limb.links[0]]:
+            return fit
+        body = self._known_body()
+        offsets = body.skeleton.offsets.astype(np.float64)
+        R, t = forward(fit.pose.root, fit.pose.local, offsets, self._table.parents)
+        reach = np.linalg.norm(offsets[outer], axis=1).sum() + 0.25
+        near = np.linalg.norm(cloud.positions - t[limb.links[0]].astype(np.float32), axis=1) < reach
+        if (near & (fit.owner < 0)).sum() < 0.4 * usual:
+            return fit
+        self.searches += 1
+        rows = np.flatnonzero(near & ((fit.owner < 0) | np.isin(fit.owner, limb.links)))
+        rows = rows[:: max(len(rows) // 60, 1)]
+        poses = np.concatenate(
+            [
+                fit.pose.local[limb.links][None],
+                self._state.local[limb.links][None],
+                nearby_poses(limb, fit.pose.local, self._table),
+                nearby_poses(limb, self._state.local, self._table),
+                limb.poses,
+            ]
+        )
+        costs = score_poses(
+            cloud.positions[rows], cloud.normals[rows], R, t, limb.links, poses, offsets, body.surface(0),
+            self._table.parents,
+        )  # fmt: skip
+        some = _every(cloud, 4)
+        retries = [fit]
+        for k in np.argsort(costs, kind="stable")[:3]:
+            start = with_limb(fit.pose, limb, poses[k])
+            retries.append(self._fit(some, start, start, LIMB))
+        scores = [self._judge(some, retry.pose).score for retry in retries]
+        best = int(np.argmin(scores))
+        if scores[best] > 0.96 * scores[0]:
+            self._retry_after[limb.links[0]] = self._frames + RETRY_FRAMES
+            return fit
+        return self._fit(cloud, retries[best].pose, retries[best].pose, FINE)
+
+    def _accept(self, fit: FitArrays, cloud: PointCloud, capture_ns: int) -> FitResult:
+        """Takes the fit as the new state, lets the model learn from it, and says how it went."""
+        body = self._known_body()
+        local = quaternion.to_matrix(quaternion.from_matrix(fit.pose.local))  # rounding must not add up over frames
+        if capture_ns > self._times_ns[0]:
+            self._before, self._times_ns = self._state, (capture_ns, self._times_ns[0])
+        self._state = PoseState(fit.pose.root, local)
+        share = fit.explained / max(len(cloud), 1)
+        self._usual = np.where(share > self._usual, share, self._usual + 0.02 * (share - self._usual))
+        confidence = self._link_confidence(fit, len(cloud))
+        pose = SkeletonPose(fit.pose.root, quaternion.from_matrix(local), confidence)
+        self._learn(fit, pose, cloud, capture_ns)
+        sure = float(np.clip((self._settings.lost_score - fit.score) / self._settings.lost_score * 1.25, 0.0, 1.0))
+        self._result = FitResult(
+            skeleton=body.skeleton,
+            pose=pose,
+            converged=fit.score < self._settings.lost_score,
+            iterations=COARSE.iterations + FINE.iterations,
+            inliers=fit.inliers,
+            rms_m=fit.rms_m,
+            confidence=sure,
+        )
+        return self._result
+
+    def _learn(self, fit: FitArrays, pose: SkeletonPose, cloud: PointCloud, capture_ns: int) -> None:
+        """Adds every third good cloud while building; grids follow one link a frame, so that no frame waits long."""
+        body = self._known_body()
+        self._status = "tracking" if self._building_until_ns is None else "tracking, learning the surface"
+        if self._building_until_ns is not None:
+            if fit.score < self._settings.good_score and self._frames % LEARN_EVERY == 0:
+                body.add(cloud, forward_kinematics(body.skeleton, pose))
+            if capture_ns >= self._building_until_ns:
+                self._building_until_ns = None
+        body.surface(1)
+
+    def _link_confidence(self, fit: FitArrays, count: int) -> Array:
+        seen = fit.explained / np.maximum(fit.assigned, 1.0)
+        enough = np.clip(fit.explained / np.maximum(0.3 * self._usual * count, 6.0), 0.0, 1.0)
+        confidence = np.clip(seen * enough, 0.0, 1.0)
+        for side in ("left", "right"):
+            for link, mover in _FOLLOWS.items():
+                confidence[LINK_INDEX[f"{side}_{link}"]] = confidence[LINK_INDEX[f"{side}_{mover}"]]
+        return confidence.astype(np.float32)
+
+    def _unseen(self) -> FitResult | None:
+        """The last pose, not to be trusted; None when there never was one."""
+        if self._result is None:
+            return None
+        last = self._result
+        pose = SkeletonPose(last.pose.root_position, last.pose.rotations, np.zeros(LINK_COUNT, np.float32))
+        return FitResult(last.skeleton, pose, False, 0, 0.0, 0.0, 0.0)
+
+
+def _state_of(pose: SkeletonPose) -> PoseState:
+    return PoseState(
+        pose.root_position.astype(np.float64), quaternion.to_matrix(pose.rotations.astype(np.float64))
+    )
+
+
+def _every(cloud: PointCloud, step: int) -> PointCloud:
+    if step <= 1:
+        return cloud
+    return PointCloud(cloud.positions[::step].copy(), cloud.normals[::step].copy(), cloud.colours[::step].copy())

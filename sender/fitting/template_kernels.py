@@ -1,0 +1,205 @@
+"""Kernels of the template's fit: forward kinematics, nearest cones, rows of the normal equations.
+
+All on plain arrays named as in ``body_template.Template``: P parameters θ, L links, K cones, N points. A cone's ends
+and radii are ``ends`` (K, 2, 3) and ``radii`` (K, 2) [m, world]; ``d_ends`` (P, K, 2, 3) and ``d_radii`` (P, K, 2) are
+their derivatives. H (P, P) gets its lower triangle only.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+_STEP = 1e-5  # of the difference quotients
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _turn(parent, x, y, z, out):  # type: ignore[no-untyped-def]
+    """``out`` = rotation ``parent`` (3, 3) times that of the rotation vector (x, y, z) [rad] (Rodrigues)."""
+    angle = np.sqrt(x * x + y * y + z * z)
+    s = np.sin(angle) / angle if angle > 1e-9 else 1.0
+    c = (1.0 - np.cos(angle)) / (angle * angle) if angle > 1e-9 else 0.5
+    for row in range(3):
+        p, q, r = parent[row, 0], parent[row, 1], parent[row, 2]
+        out[row, 0] = p * (1 - c * (y * y + z * z)) + q * (c * x * y + s * z) + r * (c * x * z - s * y)
+        out[row, 1] = p * (c * x * y - s * z) + q * (1 - c * (x * x + z * z)) + r * (c * y * z + s * x)
+        out[row, 2] = p * (c * x * z + s * y) + q * (c * y * z - s * x) + r * (1 - c * (x * x + y * y))
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _advance(rotation, lengths, sizes, theta, out):  # type: ignore[no-untyped-def]
+    """``out`` (3,) += rotation · lengths, each length [fraction of stature] stretched by its size in θ."""
+    for axis in range(3):
+        size = sizes[axis]
+        length = lengths[axis] * theta[0] * (theta[size] if size >= 0 else 1.0)
+        for row in range(3):
+            out[row] += rotation[row, axis] * length
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def place(theta, heading, tables, root, vectors, rotations, origins, ends, radii):  # type: ignore[no-untyped-def]
+    """Forward kinematics of the template: fills the link frames and the cones in the world.
+
+    ``heading`` [rad]: the root's rotation about y before its own rotation vector; ``root``: index in θ of its position.
+    ``vectors`` (L, 3), all zero where no angle is free, ``rotations`` (L, 3, 3), ``origins`` (L, 3) [m] are work space.
+    """
+    parents, offsets, offset_sizes, ends0, end_sizes, radii0, radius_sizes, cone_links, angle_links, angle_axes = tables
+    for a in range(len(angle_links)):
+        vectors[angle_links[a], angle_axes[a]] = theta[root + 3 + a]
+    facing = np.zeros((3, 3))
+    facing[0, 0] = facing[2, 2] = np.cos(heading)
+    facing[0, 2], facing[2, 0] = np.sin(heading), -np.sin(heading)
+    facing[1, 1] = 1.0
+    _turn(facing, vectors[0, 0], vectors[0, 1], vectors[0, 2], rotations[0])
+    origins[0] = theta[root : root + 3]
+    for link in range(1, len(parents)):
+        parent = parents[link]
+        _turn(rotations[parent], vectors[link, 0], vectors[link, 1], vectors[link, 2], rotations[link])
+        origins[link] = origins[parent]
+        _advance(rotations[parent], offsets[link], offset_sizes[link], theta, origins[link])
+    for k in range(len(cone_links)):
+        link = cone_links[k]
+        for end in range(2):
+            radii[k, end] = radii0[k, end] * theta[0] * theta[radius_sizes[k]]
+            ends[k, end] = origins[link]
+            _advance(rotations[link], ends0[k, end], end_sizes[k], theta, ends[k, end])
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def jacobian(theta, heading, tables, root, ends, radii, d_ends, d_radii):  # type: ignore[no-untyped-def]
+    """Cones at θ and their derivatives by every parameter, as difference quotients."""
+    L = len(tables[0])
+    vectors, rotations, origins = np.zeros((L, 3)), np.empty((L, 3, 3)), np.empty((L, 3))
+    place(theta, heading, tables, root, vectors, rotations, origins, ends, radii)
+    moved = theta.copy()
+    for p in range(len(theta)):
+        moved[p] = theta[p] + _STEP
+        place(moved, heading, tables, root, vectors, rotations, origins, d_ends[p], d_radii[p])
+        moved[p] = theta[p]
+        for k in range(len(ends)):
+            for end in range(2):
+                d_radii[p, k, end] = (d_radii[p, k, end] - radii[k, end]) / _STEP
+                for axis in range(3):
+                    d_ends[p, k, end, axis] = (d_ends[p, k, end, axis] - ends[k, end, axis]) / _STEP
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def match(points, normals, ends, radii, used, cone, along, distance, outward):  # type: ignore[no-untyped-def]
+    """Each point's nearest used cone: its index, the place on its axis 0..1, the signed distance [m], the normal.
+
+    A cone whose surface faces away there is no match; one that faces aside is charged for it.
+    """
+    for i in range(len(points)):
+        best = 1e9
+        cone[i] = -1
+        for k in range(len(ends)):
+            if not used[k]:
+                continue
+            ax, ay, az = ends[k, 0]
+            bx, by, bz = ends[k, 1, 0] - ax, ends[k, 1, 1] - ay, ends[k, 1, 2] - az
+            px, py, pz = points[i, 0] - ax, points[i, 1] - ay, points[i, 2] - az
+            t = (px * bx + py * by + pz * bz) / (bx * bx + by * by + bz * bz)
+            t = min(max(t, 0.0), 1.0)
+            px, py, pz = px - t * bx, py - t * by, pz - t * bz
+            length = np.sqrt(px * px + py * py + pz * pz) + 1e-9
+            facing = (px * normals[i, 0] + py * normals[i, 1] + pz * normals[i, 2]) / length
+            if facing < 0.0:
+                continue
+            d = length - (radii[k, 0] + t * (radii[k, 1] - radii[k, 0]))
+            cost = abs(d) + 0.04 * (1.0 - facing)
+            if cost < best:
+                best = cost
+                cone[i] = k
+                along[i] = t
+                distance[i] = d
+                outward[i, 0], outward[i, 1], outward[i, 2] = px / length, py / length, pz / length
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _add_row(row, residual, weight, H, g):  # type: ignore[no-untyped-def]
+    for p in range(len(row)):
+        if row[p] != 0.0:
+            g[p] += weight * row[p] * residual
+            for q in range(p + 1):
+                H[p, q] += weight * row[p] * row[q]
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def add_points(cone, along, distance, outward, d_ends, d_radii, scale_m, sigma_m, H, g):  # type: ignore[no-untyped-def]
+    """Add the points' rows to H (P, P) and g (P,); return their summed Geman–McClure cost d²/(d² + scale²)."""
+    P = len(g)
+    row = np.empty(P)
+    nonzero = np.empty(P, np.int64)
+    total = 0.0
+    for i in range(len(cone)):
+        k = cone[i]
+        if k < 0:
+            total += 1.0
+            continue
+        d2 = distance[i] * distance[i]
+        ratio = 1.0 / (1.0 + d2 / (scale_m * scale_m))
+        total += 1.0 - ratio
+        weight = ratio * ratio / (sigma_m * sigma_m)
+        t = along[i]
+        count = 0
+        for p in range(P):
+            value = -(1.0 - t) * d_radii[p, k, 0] - t * d_radii[p, k, 1]
+            for axis in range(3):
+                value -= outward[i, axis] * ((1.0 - t) * d_ends[p, k, 0, axis] + t * d_ends[p, k, 1, axis])
+            if value != 0.0:
+                row[count] = value
+                nonzero[count] = p
+                count += 1
+        for a in range(count):
+            p = nonzero[a]
+            g[p] += weight * row[a] * distance[i]
+            for b in range(a + 1):
+                H[p, nonzero[b]] += weight * row[a] * row[b]
+    return total
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def add_extents(points, ends, radii, d_ends, d_radii, tips, sigma_m, H, g):  # type: ignore[no-untyped-def]
+    """Rows for the body's ends: how far points reach past the end of cone ``tips[j]``, along its axis.
+
+    Points beyond the middle of the cone and within a hand's breadth of its axis count; the third farthest is the
+    extent, so that two stray points do not stretch a limb.
+    """
+    P = len(g)
+    row = np.empty(P)
+    for k in tips:
+        ax, ay, az = ends[k, 1, 0] - ends[k, 0, 0], ends[k, 1, 1] - ends[k, 0, 1], ends[k, 1, 2] - ends[k, 0, 2]
+        length = np.sqrt(ax * ax + ay * ay + az * az) + 1e-9
+        ax, ay, az = ax / length, ay / length, az / length
+        first, second, third = -1e9, -1e9, -1e9
+        for i in range(len(points)):
+            px, py, pz = points[i, 0] - ends[k, 0, 0], points[i, 1] - ends[k, 0, 1], points[i, 2] - ends[k, 0, 2]
+            s = px * ax + py * ay + pz * az
+            aside2 = px * px + py * py + pz * pz - s * s
+            reach = radii[k, 1] + 0.03
+            if s < 0.3 * length or s > length + 0.12 or aside2 > reach * reach:
+                continue
+            if s > first:
+                first, second, third = s, first, second
+            elif s > second:
+                second, third = s, second
+            elif s > third:
+                third = s
+        if third < 0.0:
+            continue
+        d = third - length - radii[k, 1]
+        for p in range(P):
+            row[p] = -d_radii[p, k, 1] - ax * d_ends[p, k, 1, 0] - ay * d_ends[p, k, 1, 1] - az * d_ends[p, k, 1, 2]
+        _add_row(row, d, 1.0 / (sigma_m * sigma_m), H, g)
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def add_floor(floor_y, ends, radii, d_ends, d_radii, feet, sigma_m, H, g):  # type: ignore[no-untyped-def]
+    """Rows that put the underside of the ``feet`` cones' ends on the floor."""
+    row = np.empty(len(g))
+    for k in feet:
+        for end in range(2):
+            d = ends[k, end, 1] - radii[k, end] - floor_y
+            for p in range(len(row)):
+                row[p] = d_ends[p, k, end, 1] - d_radii[p, k, end]
+            _add_row(row, d, 1.0 / (sigma_m * sigma_m), H, g)

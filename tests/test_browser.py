@@ -1,0 +1,137 @@
+"""The built page in a real browser (Debian's chromium, drawing in software): what a person would see."""
+
+from __future__ import annotations
+
+import asyncio
+import itertools
+from collections.abc import AsyncIterator, Callable
+from contextlib import AsyncExitStack, asynccontextmanager
+
+import numpy as np
+import pytest
+from aiohttp import web
+from aiohttp.test_utils import TestServer, unused_port
+from numpy.typing import NDArray
+
+from receiver.viewer.viewer import ConnectionState, ViewerStatus
+from receiver.viewer.web_viewer import PAGE_FOLDER, WebViewer
+from tests.capsule_person import SHIRT, SKIN, TROUSERS, capsule_person, shown_frame
+from tests.chromium import Page, find_chromium, open_page
+
+pytestmark = [
+    pytest.mark.skipif(find_chromium() is None, reason="no chromium here (Debian: apt-get install chromium)"),
+    pytest.mark.skipif(not (PAGE_FOLDER / "index.html").is_file(), reason="the page is not built (./scripts/setup)"),
+]
+
+RECEIVING = ViewerStatus(
+    ConnectionState.RECEIVING,
+    frame_rate_hz=30,
+    skeleton_bps=71_300,
+    bulk_bps=1_913_000,
+    repository_poses=12,
+    chosen_pose=7,
+    sigma=0.0314,
+)
+STATE = "document.body.dataset.state"
+HEADLINE = "document.getElementById('banner-title').textContent"
+
+
+def figure(name: str) -> str:
+    return f"document.querySelector('[data-figure={name}]').textContent"
+
+
+@asynccontextmanager
+async def receiver(port: int | None = None) -> AsyncIterator[tuple[WebViewer, str]]:
+    """A viewer and the address of its page."""
+    viewer = WebViewer()
+    app = web.Application()
+    viewer.add_routes(app)
+    async with TestServer(app, port=port) as server:
+        yield viewer, str(server.make_url("/"))
+
+
+@asynccontextmanager
+async def person_moving(viewer: WebViewer) -> AsyncIterator[None]:
+    """Shows the capsule person at 30 frames a second."""
+    person = capsule_person(pose_id=7)
+
+    async def move() -> None:
+        for sequence in itertools.count():
+            viewer.show(shown_frame(person, sequence / 30, sequence))
+            await asyncio.sleep(1 / 30)
+
+    viewer.add_pose(person)
+    viewer.set_status(RECEIVING)
+    moving = asyncio.create_task(move())
+    try:
+        yield
+    finally:
+        moving.cancel()
+
+
+def coloured(picture: NDArray[np.uint8], rgb: tuple[int, int, int]) -> NDArray[np.bool_]:
+    """Pixels (H, W) of that colour."""
+    return (np.abs(picture.astype(int) - rgb) < 12).all(axis=2)
+
+
+async def photograph_when(page: Page, accept: Callable[[NDArray[np.uint8]], object]) -> NDArray[np.uint8]:
+    """The first picture that is accepted."""
+    async with asyncio.timeout(30):
+        while not accept(picture := await page.photograph()):  # noqa: ASYNC110
+            await asyncio.sleep(0.1)
+    return picture
+
+
+@pytest.mark.parametrize(("width", "height", "phone"), [(1000, 700, False), (390, 844, True)], ids=["desktop", "phone"])
+async def test_person_moves_on_the_canvas(width: int, height: int, phone: bool) -> None:
+    async with receiver() as (viewer, url), person_moving(viewer), open_page(url, width, height, phone) as page:
+        await page.wait_for(STATE, lambda state: state == "receiving")
+        first = await photograph_when(page, lambda p: coloured(p, SHIRT).sum() > 500)
+        for rgb in (SHIRT, SKIN, TROUSERS):
+            assert coloured(first, rgb).sum() > 0.002 * width * height
+        rows, columns = np.nonzero(coloured(first, SHIRT) | coloured(first, SKIN) | coloured(first, TROUSERS))
+        assert 0 < columns.min() < columns.max() < width - 1  # all of the person is in the picture
+        assert 0 < rows.min() < rows.max() < height - 1
+        arms = coloured(first, SKIN)
+        await photograph_when(page, lambda p: (coloured(p, SKIN) ^ arms).sum() > 200)  # they have moved
+        assert page.problems == []
+
+
+async def test_figures_and_keys() -> None:
+    async with receiver() as (viewer, url), person_moving(viewer), open_page(url, 1000, 700) as page:
+        await page.wait_for(figure("fps"), lambda text: text.endswith(" fps") and int(text.split()[0]) > 0)
+        age = await page.wait_for(figure("age"), lambda text: text.endswith(" ms"))
+        assert int(age.split()[0]) >= 42  # the frame's own age, and the time it waited here
+        shown = [await page.evaluate(figure(name)) for name in ("skeleton", "bulk", "repository", "pose", "sigma")]
+        assert shown == ["71.3 kbit/s", "1913 kbit/s", "12 poses", "#7", "0.031"]
+
+        overlay = (127, 216, 255)
+        assert coloured(await page.photograph(), overlay).sum() == 0
+        await page.press("s")
+        await photograph_when(page, lambda p: coloured(p, overlay).sum() > 50)
+
+        visible = "getComputedStyle(document.getElementById('hud')).display !== 'none'"
+        assert await page.evaluate(visible)
+        await page.press("h")
+        await page.wait_for(f"!({visible})")
+        assert page.problems == []
+
+
+async def test_waiting_lost_and_back() -> None:
+    port = unused_port()
+    async with AsyncExitStack() as browser:
+        async with receiver(port) as (viewer, url):
+            page = await browser.enter_async_context(open_page(url, 800, 600))
+            await page.wait_for(HEADLINE, lambda text: text == "Waiting for sender…")
+            async with person_moving(viewer):
+                await page.wait_for(STATE, lambda state: state == "receiving")
+                await photograph_when(page, lambda p: coloured(p, SHIRT).sum() > 500)
+            viewer.set_status(ViewerStatus(ConnectionState.LOST, "The sender is silent for 3 s."))
+            await page.wait_for(HEADLINE, lambda text: text == "Connection lost")
+            assert "silent for 3 s" in await page.evaluate("document.getElementById('banner').innerText")
+            await photograph_when(page, lambda p: coloured(p, SHIRT).sum() == 0)  # an old picture is grey
+        await page.wait_for(STATE, lambda state: state == "disconnected")
+        async with receiver(port) as (viewer, _), person_moving(viewer):
+            await page.wait_for(STATE, lambda state: state == "receiving")
+            await photograph_when(page, lambda p: coloured(p, SHIRT).sum() > 500)
+        assert page.problems == []

@@ -1,0 +1,114 @@
+"""DISPOSE Eq. (1)–(2) against a plain second computation, and the properties the paper states."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from common.body.distortion_score import (
+    START_THRESHOLD,
+    SessionThreshold,
+    default_region_weights,
+    distortion_score,
+    distortion_scores,
+)
+from common.body.rigged_mesh import RiggedMesh, joint_edges
+from common.body.skeleton import LINK_COUNT, LINK_INDEX
+from common.body.skeleton_pose import SkeletonPose
+from common.body.skinning import animate_rigid, link_motion
+from tests.capsule_views import arms_down_by, captured, links_of
+
+WEIGHTS = default_region_weights()
+EQUAL = np.ones(LINK_COUNT, np.float32)
+
+
+def by_the_book(mesh: RiggedMesh, pose: SkeletonPose, weights: np.ndarray) -> float:
+    """Animate everything, take every edge of every triangle, Eq. (1) per region, Eq. (2)."""
+    before, after = mesh.mesh.vertices, animate_rigid(mesh, link_motion(mesh, links_of(pose)))
+    pairs = {
+        (min(a, b), max(a, b))
+        for face in mesh.mesh.faces.tolist()
+        for a, b in zip(face, face[1:] + face[:1], strict=True)
+    }
+    ends = np.array(sorted(pairs))
+    length = np.linalg.norm(before[ends[:, 0]] - before[ends[:, 1]], axis=1)
+    change = np.abs(np.linalg.norm(after[ends[:, 0]] - after[ends[:, 1]], axis=1) - length)
+    links = mesh.vertex_link[ends]
+    scores = []
+    for region in range(LINK_COUNT):
+        deformable = (links == region).any(axis=1) & (links[:, 0] != links[:, 1])
+        if deformable.any():
+            scores.append(weights[region] * change[deformable].sum() / length[deformable].sum())
+    return float(np.mean(scores))
+
+
+@pytest.mark.parametrize("weights", [EQUAL, WEIGHTS], ids=["equal", "default"])
+@pytest.mark.parametrize("angle_rad", [0.2, 1.3])
+def test_it_is_the_papers_equation(angle_rad: float, weights: np.ndarray) -> None:
+    mesh, target = captured(0.8), arms_down_by(angle_rad, turned_rad=0.4)
+    expected = by_the_book(mesh, target, weights)
+    assert expected > 0.01
+    assert distortion_score(mesh, links_of(target), weights) == pytest.approx(expected, rel=2e-3)
+
+
+def test_its_own_skeleton_costs_nothing() -> None:
+    assert distortion_score(captured(0.8), links_of(arms_down_by(0.8)), WEIGHTS) < 1e-4
+
+
+def test_moving_and_turning_the_whole_person_costs_nothing() -> None:
+    assert distortion_score(captured(0.8), links_of(arms_down_by(0.8, turned_rad=2.0)), WEIGHTS) < 1e-3
+
+
+def test_it_grows_with_the_motion() -> None:
+    scores = [distortion_score(captured(0.4), links_of(arms_down_by(a)), WEIGHTS) for a in (0.4, 0.6, 0.9, 1.3)]
+    assert scores == sorted(scores)
+    assert scores[-1] > 5 * scores[1] > 0
+
+
+def test_it_is_not_commutative() -> None:
+    """Arms at the sides are joined to the body; spread arms are not: only one way something tears."""
+    down, out = 1.4, 0.3
+    from_down = distortion_score(captured(down, cameras=1), links_of(arms_down_by(out)), WEIGHTS)
+    from_out = distortion_score(captured(out, cameras=1), links_of(arms_down_by(down)), WEIGHTS)
+    assert from_down > 1.5 * from_out
+
+
+def test_a_batch_scores_like_one_by_one() -> None:
+    mesh = captured(0.8)
+    targets = np.stack([links_of(arms_down_by(a)) for a in (0.1, 0.8, 1.2)])
+    batch = distortion_scores(mesh.joint_edges, targets, WEIGHTS)
+    np.testing.assert_allclose(batch, [distortion_score(mesh, T, WEIGHTS) for T in targets], rtol=1e-6)
+    assert batch.dtype == np.float32
+    assert len(distortion_scores(mesh.joint_edges, targets[:0], WEIGHTS)) == 0
+
+
+def test_a_regions_weight_counts() -> None:
+    target = links_of(arms_down_by(1.3))
+    without = EQUAL.copy()
+    without[[LINK_INDEX["left_upper_arm"], LINK_INDEX["right_upper_arm"]]] = 0
+    assert distortion_score(captured(0.4), target, without) < 0.8 * distortion_score(captured(0.4), target, EQUAL)
+    assert WEIGHTS[LINK_INDEX["left_fingers"]] < WEIGHTS[LINK_INDEX["left_hand"]] < WEIGHTS[LINK_INDEX["head"]]
+
+
+def test_a_mesh_without_joint_edges_cannot_be_judged() -> None:
+    mesh = captured(0.8)
+    one_link = np.zeros_like(mesh.vertex_link)
+    scrap = dataclasses.replace(
+        mesh, vertex_link=one_link, joint_edges=joint_edges(mesh.mesh, one_link, mesh.T_link_world)
+    )
+    assert distortion_score(scrap, links_of(arms_down_by(0.8)), WEIGHTS) == float("inf")
+
+
+def test_threshold_starts_at_the_papers_and_follows_the_session() -> None:
+    threshold = SessionThreshold(memory_frames=10)
+    assert threshold.value == START_THRESHOLD
+    for sigma in (1.0, 2.0, 3.0):
+        threshold.follow(sigma)
+    assert threshold.value == pytest.approx(2.0)
+    for _ in range(100):
+        threshold.follow(0.5)
+    assert threshold.value == pytest.approx(0.5, rel=0.01)
+    threshold.follow(float("inf"))
+    assert np.isfinite(threshold.value)

@@ -1,0 +1,125 @@
+"""The page's WebSocket messages, read back here field by field as the page reads them."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import struct
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from common.body.rigged_mesh import RiggedMesh
+from common.body.skeleton import LINK_COUNT, LINK_PARENTS
+from common.geometry.triangle_mesh import TriangleMesh
+from receiver.viewer import page_messages
+from receiver.viewer.viewer import ConnectionState, ViewerStatus
+from tests.capsule_person import capsule_person, shown_frame
+
+PERSON = capsule_person(pose_id=7)
+
+
+def trimmed(vertices: int) -> RiggedMesh:
+    """The person's first vertices and one face, so that every remainder of the padding occurs."""
+    mesh = TriangleMesh(
+        PERSON.mesh.vertices[:vertices], np.array([[0, 1, vertices - 1]], np.int32), PERSON.mesh.colours[:vertices]
+    )
+    return dataclasses.replace(
+        PERSON, mesh=mesh, vertex_link=PERSON.vertex_link[:vertices], faces_drawn=mesh.faces.copy()
+    )
+
+
+@pytest.mark.parametrize("mesh", [PERSON, *(trimmed(n) for n in (3, 4, 5, 6))], ids=lambda m: str(len(m.vertex_link)))
+def test_pose_message_holds_the_mesh(mesh: RiggedMesh) -> None:
+    message = page_messages.encode_pose(mesh)
+    version, kind, zero, pose_id, vertices, faces = struct.unpack_from("<BBHIII", message)
+    assert (version, kind, zero, pose_id) == (page_messages.VERSION, page_messages.POSE, 0, 7)
+    assert (vertices, faces) == (len(mesh.mesh.vertices), len(mesh.faces_drawn))
+    box_min, box_size = np.frombuffer(message, "<f4", 6, 16).reshape(2, 3)
+    quantized = np.frombuffer(message, "<u2", 3 * vertices, 40).reshape(-1, 3)
+    colour_offset = 40 + (6 * vertices + 3) // 4 * 4
+    colour_link = np.frombuffer(message, np.uint8, 4 * vertices, colour_offset).reshape(-1, 4)
+    index = np.frombuffer(message, "<u4", 3 * faces, colour_offset + 4 * vertices).reshape(-1, 3)
+
+    assert len(message) == colour_offset + 4 * vertices + 12 * faces
+    assert np.abs(box_min + box_size * (quantized / 65535) - mesh.mesh.vertices).max() < 2e-5  # half a step of 1.9 m
+    np.testing.assert_array_equal(colour_link[:, :3], mesh.mesh.colours)
+    np.testing.assert_array_equal(colour_link[:, 3], mesh.vertex_link)
+    np.testing.assert_array_equal(index, mesh.faces_drawn)
+
+
+def test_flat_mesh_keeps_its_plane() -> None:
+    flat = PERSON.mesh.vertices.copy()
+    flat[:, 1] = 0.5
+    mesh = dataclasses.replace(PERSON, mesh=dataclasses.replace(PERSON.mesh, vertices=flat))
+    message = page_messages.encode_pose(mesh)
+    box_min, box_size = np.frombuffer(message, "<f4", 6, 16).reshape(2, 3)
+    y = np.frombuffer(message, "<u2", 3 * len(flat), 40).reshape(-1, 3)[:, 1] / 65535
+    np.testing.assert_allclose(box_min[1] + box_size[1] * y, 0.5, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    "broken",
+    [
+        dataclasses.replace(PERSON, faces_drawn=np.zeros((0, 3), np.int32)),
+        dataclasses.replace(PERSON, vertex_link=PERSON.vertex_link[:-1]),
+        dataclasses.replace(PERSON, faces_drawn=np.array([[0, 1, len(PERSON.vertex_link)]], np.int32)),
+    ],
+    ids=["no face", "a link short", "a face too far"],
+)
+def test_mesh_that_cannot_be_shown_is_refused(broken: RiggedMesh) -> None:
+    with pytest.raises(ValueError, match="pose 7"):
+        page_messages.encode_pose(broken)
+
+
+def test_frame_message_holds_the_frame_in_half_a_megabit() -> None:
+    frame = shown_frame(PERSON, time_s=1.3, sequence=90)
+    frame = dataclasses.replace(frame, confidence=np.linspace(-0.5, 1.5, LINK_COUNT, dtype=np.float32))
+    message = page_messages.encode_frame(frame)
+    head = struct.unpack_from("<BBHIIfff", message)
+    assert head[:5] == (page_messages.VERSION, page_messages.FRAME, 0, 7, 90)
+    assert head[5:] == pytest.approx((frame.sigma, frame.fit_confidence, frame.age_ms))
+    motion = np.frombuffer(message, "<f4", 12 * LINK_COUNT, 24).reshape(-1, 3, 4)
+    joints = np.frombuffer(message, "<f4", 3 * LINK_COUNT, 24 + 48 * LINK_COUNT).reshape(-1, 3)
+    confidence = np.frombuffer(message, np.uint8, LINK_COUNT, 24 + 60 * LINK_COUNT)
+    np.testing.assert_array_equal(motion, frame.motion)
+    np.testing.assert_array_equal(joints, frame.joints)
+    assert (confidence[0], confidence[-1]) == (0, 255)
+    assert np.abs(confidence / 255 - np.clip(frame.confidence, 0, 1)).max() < 1 / 255
+    assert len(message) % 4 == 0
+    assert len(message) * 8 * 30 < 500_000
+
+
+def test_frame_without_a_pose_says_so() -> None:
+    message = page_messages.encode_frame(shown_frame(None, time_s=0.0))
+    assert struct.unpack_from("<I", message, 4)[0] == page_messages.NO_POSE
+
+
+def test_remove_message_names_the_pose() -> None:
+    assert page_messages.encode_remove(7) == struct.pack("<BBHI", page_messages.VERSION, page_messages.REMOVE, 0, 7)
+
+
+def test_status_is_json_even_where_numbers_are_missing() -> None:
+    status = ViewerStatus(ConnectionState.RECEIVING, "", 29.9, float("nan"), 71_000.0, sigma=float("inf"))
+    figures = json.loads(page_messages.encode_status(status), parse_constant=pytest.fail)
+    assert figures["kind"] == "status"
+    assert figures["connection"] == "receiving"
+    assert figures["skeleton_bps"] == 71_000.0
+    assert figures["pose_age_ms"] is None
+    assert figures["sigma"] is None
+
+
+def test_hello_tells_the_link_tree() -> None:
+    hello = json.loads(page_messages.encode_hello())
+    assert hello == {"kind": "hello", "version": page_messages.VERSION, "link_parents": list(LINK_PARENTS)}
+
+
+@given(st.binary(max_size=16))
+def test_acknowledgement_is_four_bytes_or_refused(message: bytes) -> None:
+    if len(message) == 4:
+        assert page_messages.decode_acknowledgement(message) == int.from_bytes(message, "little")
+    else:
+        with pytest.raises(ValueError, match="bytes"):
+            page_messages.decode_acknowledgement(message)

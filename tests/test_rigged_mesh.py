@@ -1,0 +1,118 @@
+"""A candidate pose's parts become one rigged mesh: the edges that deform, and the triangles that are drawn."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from common.body.depth_mesher import mesh_view
+from common.body.rigged_mesh import DRAWN_EDGE_M, build_rigged_mesh
+from common.body.skeleton import LINK_COUNT, LINK_INDEX
+from common.body.skinning import animate_rigid, link_motion
+from common.body.view import View
+from common.geometry.rigid_transform import transform_points
+from tests.capsule_person import SKELETON
+from tests.capsule_views import arms_down_by, capsule_views, captured, links_of, ring_camera
+
+ANGLE_RAD = 1.35  # hands at the thighs
+MESH = captured(ANGLE_RAD, pose_id=7, capture_ns=123)
+
+
+def all_edges() -> set[tuple[int, int]]:
+    pairs = MESH.mesh.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
+    return {(min(a, b), max(a, b)) for a, b in pairs.tolist()}
+
+
+def test_all_views_are_in_it() -> None:
+    counts = [len(mesh_view(view).vertices) for view in capsule_views(arms_down_by(ANGLE_RAD))]
+    assert len(MESH.mesh.vertices) == sum(counts) == len(MESH.vertex_link) == len(MESH.mesh.colours)
+    owner = np.repeat(np.arange(4), counts)[MESH.mesh.faces]
+    assert (owner == owner[:, :1]).all()  # views stay separate surfaces
+    assert set(owner[:, 0]) == {0, 1, 2, 3}
+    assert (MESH.pose_id, MESH.capture_ns) == (7, 123)
+
+
+def test_link_frames_are_those_of_the_capture() -> None:
+    product = MESH.T_link_world @ links_of(arms_down_by(ANGLE_RAD))
+    np.testing.assert_allclose(product, np.broadcast_to(np.eye(4), product.shape), atol=1e-6)
+
+
+def test_joint_edges_are_the_edges_between_links_each_once() -> None:
+    ends = MESH.joint_edges.vertices
+    found = [(min(a, b), max(a, b)) for a, b in ends.tolist()]
+    expected = {(a, b) for a, b in all_edges() if MESH.vertex_link[a] != MESH.vertex_link[b]}
+    assert len(found) == len(set(found)) == len(MESH.joint_edges)
+    assert set(found) == expected
+
+
+def test_joint_edges_are_grouped_by_link_pair() -> None:
+    edges = MESH.joint_edges
+    links = MESH.vertex_link[edges.vertices]
+    of_pair = np.repeat(edges.pair_links, np.diff(edges.pair_starts), axis=0)
+    np.testing.assert_array_equal(links, of_pair)
+    assert len(np.unique(edges.pair_links, axis=0)) == len(edges.pair_links)
+    assert (edges.pair_links[:, 0] < edges.pair_links[:, 1]).all()
+
+
+def test_joint_edges_hold_their_ends_in_link_frames() -> None:
+    edges = MESH.joint_edges
+    e = len(edges) // 2
+    for k in (0, 1):
+        vertex = edges.vertices[e, k]
+        local = transform_points(MESH.T_link_world[MESH.vertex_link[vertex]], MESH.mesh.vertices[vertex][None])[0]
+        np.testing.assert_allclose(edges.points[3 * k : 3 * k + 3, e], local, atol=1e-5)
+    a, b = MESH.mesh.vertices[edges.vertices[e]]
+    assert edges.rest_lengths[e] == pytest.approx(np.linalg.norm(a - b), rel=1e-5)
+
+
+def test_an_edge_counts_in_both_its_regions() -> None:
+    edges = MESH.joint_edges
+    assert edges.region_lengths.sum() == pytest.approx(2 * edges.rest_lengths.sum(), rel=1e-4)
+    hand = LINK_INDEX["left_hand"]
+    own = (MESH.vertex_link[edges.vertices] == hand).any(axis=1)
+    assert edges.region_lengths[hand] == pytest.approx(edges.rest_lengths[own].sum(), rel=1e-4)
+
+
+def test_bridges_over_occlusions_count_but_are_not_drawn() -> None:
+    faces, vertices = MESH.mesh.faces, MESH.mesh.vertices
+    longest = np.linalg.norm(vertices[faces] - vertices[np.roll(faces, 1, axis=1)], axis=-1).max(axis=1)
+    drawn = len(MESH.faces_drawn)
+    assert 0 < drawn < len(faces)
+    np.testing.assert_array_equal(MESH.faces_drawn, faces[:drawn])
+    assert longest[:drawn].max() <= DRAWN_EDGE_M
+    assert (longest[drawn:] > DRAWN_EDGE_M).sum() > 100
+    assert MESH.joint_edges.rest_lengths.max() > DRAWN_EDGE_M
+
+
+def test_links_that_only_touch_are_not_drawn_joined() -> None:
+    links = np.sort(MESH.vertex_link[MESH.faces_drawn], axis=1)
+    joined = {(int(a), int(b)) for a, _, b in links}
+    all_links = np.sort(MESH.vertex_link[MESH.mesh.faces], axis=1)
+    thigh, hand = LINK_INDEX["left_thigh"], LINK_INDEX["left_hand"]
+    pair = (min(thigh, hand), max(thigh, hand))
+    assert pair in {(int(a), int(b)) for a, _, b in all_links}
+    assert pair not in joined
+    assert (min(LINK_INDEX["left_forearm"], hand), max(LINK_INDEX["left_forearm"], hand)) in joined
+
+
+def test_drawn_triangles_do_not_stretch_far_when_the_arms_part_from_the_body() -> None:
+    moved = animate_rigid(MESH, link_motion(MESH, links_of(arms_down_by(0.5))))
+    edges = moved[MESH.faces_drawn] - moved[np.roll(MESH.faces_drawn, 1, axis=1)]
+    hands = np.isin(MESH.vertex_link[MESH.faces_drawn], [LINK_INDEX["left_hand"], LINK_INDEX["left_fingers"]])
+    assert np.linalg.norm(edges, axis=-1)[hands.any(axis=1)].max() < 0.12
+
+
+def test_memory_is_counted() -> None:
+    assert MESH.nbytes > 12 * (len(MESH.mesh.vertices) + len(MESH.mesh.faces))
+    assert MESH.faces_drawn.base is MESH.mesh.faces  # drawn triangles cost none
+
+
+def test_views_without_a_surface_are_refused() -> None:
+    nothing = View(ring_camera(0), 0, 0, np.zeros((8, 8), np.uint16), np.zeros((8, 8, 3), np.uint8))
+    for views in ((), (nothing,)):
+        with pytest.raises(ValueError, match="pose 3"):
+            build_rigged_mesh(3, 0, SKELETON, arms_down_by(0), views)
+
+
+def test_every_link_is_known() -> None:
+    assert MESH.vertex_link.max() < LINK_COUNT

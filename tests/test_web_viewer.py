@@ -1,0 +1,233 @@
+"""The web viewer against pages made here: what they are sent, when, and who is turned away."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import struct
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
+from pathlib import Path
+from typing import Any
+
+import aiohttp
+import pytest
+from aiohttp import web
+from aiohttp.test_utils import TestServer
+
+from receiver.viewer import page_messages, web_viewer
+from receiver.viewer.page_messages import FRAME, POSE, REMOVE
+from receiver.viewer.viewer import ConnectionState, ViewerStatus
+from receiver.viewer.web_viewer import MESSAGES_UNDER_WAY, WebViewer
+from tests.capsule_person import capsule_person, shown_frame
+
+LIMIT_S = 10.0
+PERSON = capsule_person(pose_id=1)
+
+
+class Served:
+    """A viewer behind a real server, and a client to reach it."""
+
+    def __init__(self, viewer: WebViewer, server: TestServer, session: aiohttp.ClientSession) -> None:
+        self.viewer, self.server, self.session = viewer, server, session
+
+    def get(self, path: str, **headers: str) -> Any:
+        return self.session.get(self.server.make_url(path), headers=headers)
+
+    @asynccontextmanager
+    async def page(self, acknowledge: bool = True, **headers: str) -> AsyncIterator[FakePage]:
+        url = self.server.make_url("/ws")
+        async with self.session.ws_connect(url, headers=headers, max_msg_size=0, autoping=acknowledge) as socket:
+            yield FakePage(socket, acknowledge)
+
+
+class FakePage:
+    """Reads messages as a browser does: ``(kind, pose id or sequence)`` of binary ones, the JSON of text ones."""
+
+    def __init__(self, socket: aiohttp.ClientWebSocketResponse, acknowledge: bool) -> None:
+        self.socket = socket
+        self._acknowledge = acknowledge
+        self._taken_in = 0
+
+    async def next(self) -> dict[str, Any] | tuple[int, int]:
+        message = await self.socket.receive(LIMIT_S)
+        if message.type is aiohttp.WSMsgType.TEXT:
+            text: dict[str, Any] = json.loads(message.data)
+            return text
+        assert message.type is aiohttp.WSMsgType.BINARY, message
+        if self._acknowledge:
+            await self.acknowledge(1)
+        kind, pose_id, sequence = struct.unpack_from("<xBxxII", message.data + bytes(4))
+        return kind, sequence if kind == FRAME else pose_id
+
+    async def acknowledge(self, count: int) -> None:
+        self._taken_in += count
+        await self.socket.send_bytes(struct.pack("<I", self._taken_in))
+
+    async def binaries(self, count: int) -> list[tuple[int, int]]:
+        found: list[tuple[int, int]] = []
+        while len(found) < count:
+            message = await self.next()
+            if isinstance(message, tuple):
+                found.append(message)
+        return found
+
+    async def silent(self) -> bool:
+        """Nothing binary comes for a while."""
+        try:
+            message = await self.socket.receive(0.1)
+        except TimeoutError:
+            return True
+        return message.type is not aiohttp.WSMsgType.BINARY and await self.silent()
+
+
+@asynccontextmanager
+async def serve(viewer: WebViewer | None = None) -> AsyncIterator[Served]:
+    viewer = viewer or WebViewer()
+    app = web.Application()
+    viewer.add_routes(app)
+    async with TestServer(app) as server, aiohttp.ClientSession() as session:
+        yield Served(viewer, server, session)
+
+
+async def until(condition: Callable[[], bool]) -> None:
+    async with asyncio.timeout(LIMIT_S):
+        while not condition():  # noqa: ASYNC110
+            await asyncio.sleep(0.01)
+
+
+def built_page(folder: Path) -> Path:
+    for name in ("index.html", "app.js", "app.css"):
+        (folder / name).write_text(f"this is {name}")
+    return folder
+
+
+async def test_page_is_served_with_a_policy_for_its_own_files_alone(tmp_path: Path) -> None:
+    async with serve(WebViewer(built_page(tmp_path))) as served:
+        for path, name, kind in (
+            ("/", "index.html", "text/html"),
+            ("/app.js", "app.js", "text/javascript"),
+            ("/app.css", "app.css", "text/css"),
+        ):
+            async with served.get(path) as answer:
+                assert (answer.status, await answer.text()) == (200, f"this is {name}")
+                assert answer.content_type == kind
+                assert "default-src 'self'" in answer.headers["Content-Security-Policy"]
+        async with served.get("/package.json") as answer:
+            assert answer.status == 404
+
+
+async def test_page_that_was_not_built_says_what_to_do(tmp_path: Path) -> None:
+    async with serve(WebViewer(tmp_path)) as served, served.get("/") as answer:
+        assert answer.status == 503
+        assert "./scripts/setup" in await answer.text()
+
+
+@pytest.mark.parametrize("path", ["/", "/app.js", "/ws"])
+@pytest.mark.parametrize("host", ["telepose.example", "127.0.0.1.example:8080", "", "[::1"])
+async def test_foreign_names_are_turned_away(tmp_path: Path, path: str, host: str) -> None:
+    async with serve(WebViewer(built_page(tmp_path))) as served, served.get(path, Host=host) as answer:
+        assert answer.status in (400, 403)
+
+
+async def test_names_in_the_settings_are_welcome(tmp_path: Path) -> None:
+    viewer = WebViewer(built_page(tmp_path), allowed_hosts=["telepose.example"])
+    async with serve(viewer) as served, served.get("/", Host="telepose.example:8080") as answer:
+        assert answer.status == 200
+
+
+async def test_pages_of_other_sites_get_no_socket() -> None:
+    async with serve() as served:
+        own = str(served.server.make_url("")).rstrip("/")
+        async with served.page(Origin=own) as page:
+            assert (await page.next())["kind"] == "hello"  # type: ignore[call-overload]
+        with pytest.raises(aiohttp.WSServerHandshakeError, match="403"):
+            async with served.page(Origin="http://other.example"):
+                pass
+
+
+async def test_late_page_gets_what_is_there_now() -> None:
+    async with serve() as served:
+        served.viewer.add_pose(capsule_person(1))
+        served.viewer.add_pose(capsule_person(2))
+        served.viewer.add_pose(capsule_person(3))
+        served.viewer.remove_pose(3)
+        served.viewer.set_status(ViewerStatus(ConnectionState.RECEIVING, repository_poses=2))
+        for sequence in range(5):
+            served.viewer.show(shown_frame(PERSON, 0.1 * sequence, sequence))
+        async with served.page() as page:
+            hello, status = await page.next(), await page.next()
+            assert isinstance(hello, dict)
+            assert isinstance(status, dict)
+            assert (hello["kind"], hello["version"]) == ("hello", page_messages.VERSION)
+            assert (status["connection"], status["repository_poses"]) == ("receiving", 2)
+            assert await page.binaries(3) == [(POSE, 1), (FRAME, 4), (POSE, 2)]  # what is on screen comes first
+            assert await page.silent()
+
+
+async def test_mesh_is_uploaded_once_and_removed_once() -> None:
+    async with serve() as served, served.page() as page:
+        served.viewer.add_pose(PERSON)
+        assert await page.binaries(1) == [(POSE, 1)]
+        for sequence in range(3):
+            served.viewer.show(shown_frame(PERSON, 0.0, sequence))
+            assert await page.binaries(1) == [(FRAME, sequence)]
+        served.viewer.remove_pose(1)
+        assert await page.binaries(1) == [(REMOVE, 1)]
+        assert await page.silent()
+
+
+async def test_pose_id_used_again_is_uploaded_again() -> None:
+    async with serve() as served, served.page() as page:
+        served.viewer.add_pose(PERSON)
+        assert await page.binaries(1) == [(POSE, 1)]
+        served.viewer.remove_pose(1)
+        served.viewer.add_pose(capsule_person(1))
+        assert await page.binaries(1) == [(POSE, 1)]
+
+
+async def test_slow_page_skips_to_the_newest_frame_and_delays_nobody() -> None:
+    async with serve() as served, served.page(acknowledge=False) as slow, served.page() as quick:
+        await until(lambda: served.viewer.page_count == 2)
+        for sequence in range(20):
+            served.viewer.show(shown_frame(None, 0.0, sequence))
+            assert await quick.binaries(1) == [(FRAME, sequence)]
+        assert await slow.binaries(MESSAGES_UNDER_WAY) == [(FRAME, s) for s in range(MESSAGES_UNDER_WAY)]
+        assert await slow.silent()
+        await slow.acknowledge(MESSAGES_UNDER_WAY)
+        assert await slow.binaries(1) == [(FRAME, 19)]
+
+
+@pytest.mark.parametrize("nonsense", [b"", b"12345", struct.pack("<I", 99), "text", bytes(1000)], ids=repr)
+async def test_page_that_talks_nonsense_is_disconnected(nonsense: bytes | str) -> None:
+    async with serve() as served, served.page() as page:
+        assert isinstance(await page.next(), dict)
+        await (page.socket.send_str(nonsense) if isinstance(nonsense, str) else page.socket.send_bytes(nonsense))
+        await until(lambda: page.socket.closed or page.socket.close_code is not None or served.viewer.page_count == 0)
+        assert served.viewer.page_count == 0
+
+
+async def test_page_that_answers_no_ping_is_disconnected() -> None:
+    async with serve(WebViewer(heartbeat_s=0.2)) as served, served.page(acknowledge=False):
+        await until(lambda: served.viewer.page_count == 1)
+        await until(lambda: served.viewer.page_count == 0)
+
+
+async def test_there_is_an_end_to_the_number_of_pages(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(web_viewer, "PAGES_MAX", 1)
+    async with serve() as served, served.page():
+        await until(lambda: served.viewer.page_count == 1)
+        with pytest.raises(aiohttp.WSServerHandshakeError, match="503"):
+            async with served.page():
+                pass
+
+
+async def test_pages_are_told_when_the_receiver_ends() -> None:
+    async with serve() as served, served.page() as page:
+        await until(lambda: served.viewer.page_count == 1)
+        closing = asyncio.create_task(served.server.close())
+        while (message := await page.socket.receive(LIMIT_S)).type is aiohttp.WSMsgType.TEXT:
+            pass
+        assert (message.type, message.data) == (aiohttp.WSMsgType.CLOSE, aiohttp.WSCloseCode.GOING_AWAY)
+        await closing
+        assert served.viewer.page_count == 0
