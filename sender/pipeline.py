@@ -188,7 +188,7 @@ class CandidatePath:
 
     def _encode(self, tracked: TrackedFrame) -> bytes:
         assert tracked.skeleton is not None
-        assert tracked.pose is not None
+        assert tracked.fit is not None
         identity, settings = self._identity, self._settings
         self._poses += 1
         candidate = CandidatePose(
@@ -197,7 +197,7 @@ class CandidatePath:
             epoch=identity.epoch,
             capture_ns=tracked.capture_ns,
             skeleton=tracked.skeleton,
-            pose=tracked.pose,
+            pose=tracked.fit.pose,  # not the quantised one: rounding twice could end elsewhere than the packet's
             views=tracked.views,
         )
         return encode_candidate_pose(candidate, settings.jpeg_quality, settings.depth_step_mm)

@@ -122,6 +122,7 @@ BOMBS = {
     "huge string": b"\x95\xdb\xff\xff\xff\xff",
     "huge bytes": b"\x95\xc6\xff\xff\xff\xff",
     "bytes above the bound": b"\x95\xc6\x00\x00\x20\x00" + b"\x00" * 0x2000,
+    "string above the bound": b"\x95\xd9\x41" + b"a" * 0x41,
     "huge extension": b"\x95\xc9\xff\xff\xff\xff\x05",
     "timestamp": b"\xd6\xff\x00\x00\x00\x00",
     "extension": b"\x95\xd4\x05\x00\x01\x01\x01\x01",
@@ -144,6 +145,16 @@ def test_msgpack_bombs_are_refused_without_allocation(bomb: bytes) -> None:
         assert tracemalloc.get_traced_memory()[1] < 4_000_000
     finally:
         tracemalloc.stop()
+
+
+@pytest.mark.parametrize(
+    ("bomb", "bound"),
+    [("array above the bound", "max_array_len"), ("small map", "max_map_len"), ("extension", "max_ext_len"),
+     ("bytes above the bound", "max_bin_len"), ("string above the bound", "max_str_len")],
+)  # fmt: skip
+def test_bombs_fail_at_our_bounds_and_not_only_for_want_of_data(bomb: str, bound: str) -> None:
+    with pytest.raises(WireError, match=bound):
+        decode_body(bytes([BODY_VERSION]) + BOMBS[bomb])
 
 
 def test_empty_oversized_and_foreign_messages_are_refused() -> None:

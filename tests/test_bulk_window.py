@@ -278,7 +278,7 @@ def test_room_that_appears_on_a_long_path_is_found_by_slow_start() -> None:
 
 def test_a_queue_shorter_than_the_target_is_found_by_its_losses() -> None:
     run = Simulation(ten_megabit(queue_ns=5 * MS)).run(15)
-    assert run.lost <= 0.02 * len(run.sent)
+    assert run.lost <= 0.12 * len(run.sent)  # without giving way to losses, four chunks of five would be
     assert run.goodput_bps(3, 15) >= 0.5 * 10 * MBIT
 
 

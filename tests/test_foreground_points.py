@@ -96,7 +96,7 @@ def test_distortion_is_honoured() -> None:
     cloud = PointSampler([camera], 4000, voxel_m=0.001).points([view])
     pixels, z = project(camera, cloud.positions)
     np.testing.assert_allclose(z, 2.0, atol=1e-3)
-    np.testing.assert_allclose(pixels, np.rint(pixels), atol=0.02)  # back on the pixels they came from
+    np.testing.assert_allclose(pixels, np.rint(pixels), atol=0.04)  # back on the pixels they came from
     T = camera.T_world_camera
     expected = 2.0 * pixel_rays(camera)[240, 600] @ T[:3, :3].T.astype(np.float32) + T[:3, 3].astype(np.float32)
     assert cKDTree(cloud.positions).query(expected)[0] < 0.05

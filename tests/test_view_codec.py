@@ -191,6 +191,13 @@ def test_colours_of_the_person_survive_up_to_the_silhouette() -> None:
     assert error.max() < 25
 
 
+def test_colour_keeps_its_full_resolution() -> None:
+    stripes = np.where(np.arange(24)[:, None] % 2, np.array([200, 60, 60]), np.array([60, 60, 200])).astype(np.uint8)
+    view = replace(SMALL, depth_mm=np.full((16, 24), 2000, np.uint16), colour=np.tile(stripes, (16, 1, 1)))
+    error = np.abs(decode_view(encode_view(view)).colour.astype(int) - view.colour)
+    assert error.max() < 50  # halved chroma mixes the stripes: 70
+
+
 def test_the_background_leaves_no_trace() -> None:
     assert encode_view(some_view(background=255)) == encode_view(some_view(background=0))
 

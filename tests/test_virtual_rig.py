@@ -260,9 +260,12 @@ def test_torn_and_overwritten_frames_are_not_read() -> None:
     assert pixels is not None
     assert (pixels[0] == 7).all()
     assert (pixels[1] == 9).all()
-    with ring.writing(0, 3) as (depth, _):
-        depth[:] = 8
+    with ring.writing(0, 3) as (depth, _):  # the same slot
+        depth[:2] = 8
+        assert reader.copy(0, 1) is None
+        assert reader.copy(0, 3) is None
     assert reader.copy(0, 1) is None
+    assert reader.copy(0, 3) is not None
 
 
 def test_memory_smaller_than_announced_is_refused() -> None:

@@ -22,19 +22,20 @@ BACKGROUND = 255
 class OffscreenViewer:
     """Keeps the poses and the newest frame, as a page does, and renders them when asked.
 
-    ``frames_shown`` counts the frames whose pose was there; ``status`` is the newest one.
+    ``render`` may be called from another thread than the rest. ``frames_shown`` counts the frames whose pose was
+    there; ``status`` is the newest one.
     """
 
     def __init__(self) -> None:
         self._poses: dict[int, RiggedMesh] = {}
-        self._frame: ShownFrame | None = None
+        self._on_screen: tuple[ShownFrame, RiggedMesh] | None = None  # replaced whole, so that threads see both or none
         self.frames_shown = 0
         self.status = ViewerStatus()
 
     @property
     def frame(self) -> ShownFrame | None:
         """The frame on screen; None before the first whose pose is here."""
-        return self._frame
+        return None if self._on_screen is None else self._on_screen[0]
 
     def add_pose(self, mesh: RiggedMesh) -> None:
         """Keeps the mesh until it is removed."""
@@ -43,13 +44,15 @@ class OffscreenViewer:
     def remove_pose(self, pose_id: int) -> None:
         """Forgets the mesh; a frame that shows it goes off the screen."""
         self._poses.pop(pose_id, None)
-        if self._frame is not None and self._frame.pose_id == pose_id:
-            self._frame = None
+        if self._on_screen is not None and self._on_screen[0].pose_id == pose_id:
+            self._on_screen = None
 
     def show(self, frame: ShownFrame) -> None:
-        """The frame to render from now on; without a known pose the last one stays."""
-        if frame.pose_id in self._poses:
-            self._frame = frame
+        """The frame to render from now on, nobody if it has no pose; while its pose is not here the last one stays."""
+        if frame.pose_id is None:
+            self._on_screen = None
+        elif frame.pose_id in self._poses:
+            self._on_screen = (frame, self._poses[frame.pose_id])
             self.frames_shown += 1
 
     def set_status(self, status: ViewerStatus) -> None:
@@ -61,10 +64,10 @@ class OffscreenViewer:
 
         Depth 0 = nothing there, which is everywhere while nobody is shown.
         """
-        frame = self._frame
-        if frame is None or frame.pose_id is None or frame.motion is None:
+        if (on_screen := self._on_screen) is None:
             return [_nobody(camera) for camera in cameras]
-        mesh = self._poses[frame.pose_id]
+        frame, mesh = on_screen
+        assert frame.motion is not None  # as its pose is not
         vertices = animate_rigid(mesh, frame.motion)
         return [render(vertices, mesh.faces_drawn, mesh.mesh.colours, camera, BACKGROUND) for camera in cameras]
 

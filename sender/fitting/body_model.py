@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 from common.body.skeleton import LINK_COUNT, LINK_INDEX, LINK_PARENTS, Skeleton
 from common.body.skeleton_pose import bone_segments
 from common.geometry.point_cloud import PointCloud
-from sender.fitting.articulated_gauss_newton import Surface
-from sender.fitting.closest_point_grid import LinkGrid, build_link_grid
+from sender.fitting.closest_point_grid import LinkGrid, Surface, build_link_grid
 
 Array = NDArray[Any]
 
@@ -122,7 +121,11 @@ class BodyModel:
             raise ValueError(f"body model: version {version}, this program reads {FORMAT_VERSION}")
         if counts.shape != (LINK_COUNT,) or counts.min() < 0 or counts.max() > MAX_POINTS_PER_LINK:
             raise ValueError(f"body model: point counts of {counts.shape} links do not fit {LINK_COUNT} links")
-        if sums.shape != (int(counts.sum()), _COLUMNS) or not np.isfinite(sums).all() or np.abs(sums).max(initial=0) > 1e6:
+        if (
+            sums.shape != (int(counts.sum()), _COLUMNS)
+            or not np.isfinite(sums).all()
+            or np.abs(sums).max(initial=0) > 1e6
+        ):
             raise ValueError(f"body model: points {sums.shape} do not match their counts or are not finite")
         if len(sums) and sums[:, _COUNT].min() <= 0:
             raise ValueError("body model: a point without observations")
@@ -166,21 +169,21 @@ class _LinkCells:
         keys, inverse = np.unique(np.concatenate([self.keys, _cell_keys(points, normals)]), return_inverse=True)
         sums = np.zeros((len(keys), _COLUMNS))
         _add_rows(inverse, np.concatenate([self.sums, rows]), sums)
-        sums /= np.maximum(sums[:, _COUNT :_COLUMNS] / MEMORY_FRAMES, 1.0)
+        sums /= np.maximum(sums[:, _COUNT:_COLUMNS] / MEMORY_FRAMES, 1.0)
         if len(keys) > MAX_POINTS_PER_LINK:  # keep what was seen most often
             kept = np.sort(np.argsort(-sums[:, _COUNT], kind="stable")[:MAX_POINTS_PER_LINK])
             keys, sums = keys[kept], sums[kept]
         self.keys, self.sums = keys, sums
 
     def restore(self, sums: Array) -> None:
-        points = sums[:, _POSITION] / sums[:, _COUNT :]
+        points = sums[:, _POSITION] / sums[:, _COUNT:]
         keys = _cell_keys(points, sums[:, _NORMAL])
         self.keys, first = np.unique(keys, return_index=True)
         self.sums = sums[first]
 
     def surface(self) -> tuple[Array, Array, Array]:
         """Points (M, 3) [m, link frame], unit normals (M, 3), colours (M, 3) uint8."""
-        count = self.sums[:, _COUNT :]
+        count = self.sums[:, _COUNT:]
         normals = self.sums[:, _NORMAL]
         normals = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-9)
         return self.sums[:, _POSITION] / count, normals, (self.sums[:, _COLOUR] / count).astype(np.uint8)
@@ -189,7 +192,7 @@ class _LinkCells:
         return self.sums[:, _RIGID] / self.sums[:, _COUNT]
 
 
-@njit(nogil=True, cache=True)  # type: ignore[untyped-decorator]
+@njit(nogil=True, cache=True)
 def _add_rows(targets: Array, rows: Array, sums: Array) -> None:
     for n in range(len(targets)):
         for column in range(rows.shape[1]):
@@ -243,7 +246,7 @@ def _joined() -> Array:
 _MOVER, _JOINED = _movers(), _joined()
 
 
-@njit(nogil=True, cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@njit(nogil=True, cache=True, error_model="numpy")
 def nearest_bones(points: Array, starts: Array, ends: Array, radii: Array) -> tuple[Array, Array, Array]:
     """Nearest and second nearest bone (N,), (N,) int64 of ``points`` (N, 3) [m, world] by distance ÷ radius, and the
     ratio (N,) of the two distances; ``starts, ends`` (L, 3) [m, world], ``radii`` (L,) [m]."""

@@ -1,4 +1,4 @@
-"""Closest model points looked up, not searched (algorithms.md §8).
+"""Closest model points looked up, not searched.
 
 The points of a link never move in the link's own frame, so for every cell of a grid around them the nearest point is
 found once. Each cell has six answers, one for each main direction of a normal: a forearm that jumped further than its
@@ -17,11 +17,13 @@ Array = NDArray[Any]
 
 NORMAL_BINS = 6
 BIN_COSINE = 0.25  # a point is in every bin whose direction is within 75° of its normal
+NEAR_LINKS = 12  # candidate links a point may have
+NORMAL_GATE = 0.35  # least cosine between the normals of a point and its match
 MAX_CELLS = 12_000  # of each main direction: large links get coarser cells, which their flat surfaces allow
 
 
 class LinkGrid(NamedTuple):
-    """``points, normals`` (M, 3) float32 in the link's frame [m]; ``origin`` (3,) float32 [m]: corner of cell (0, 0, 0);
+    """``points, normals`` (M, 3) float32 [m, link frame]; ``origin`` (3,) float32 [m]: corner of cell (0, 0, 0);
     ``cell_m``: edge; ``nearest`` (6, nx, ny, nz) int16: row of the closest point for a normal of that main direction
     (+x, -x, +y, -y, +z, -z), -1 where the link has none."""
 
@@ -51,10 +53,10 @@ def build_link_grid(points: Array, normals: Array, cell_m: float, margin_m: floa
     return LinkGrid(points, normals, origin, cell_m, nearest)
 
 
-@njit(nogil=True, cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
-def _fill_nearest(points: Array, normals: Array, origin: Array, cell: float, nearest: Array) -> None:
+@njit(nogil=True, cache=True, error_model="numpy")
+def _fill_nearest(points: Array, normals: Array, origin: Array, cell: np.float32, nearest: Array) -> None:
     """Seeds each bin with its points, then hands the best candidate on to the neighbours, there and back twice
-    (Danielsson's vector distance transform)."""
+    (Danielsson's vector distance transform; once would leave errors of several cells)."""
     bins, nx, ny, nz = nearest.shape
     distance = np.empty((nx, ny, nz), np.float32)
     for b in range(bins):
@@ -78,7 +80,7 @@ def _fill_nearest(points: Array, normals: Array, origin: Array, cell: float, nea
                         _take_from_neighbours(points, origin, cell, best, distance, x, y, z, 1)
 
 
-@njit(nogil=True, cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@njit(nogil=True, cache=True, error_model="numpy")
 def _take_from_neighbours(
     points: Array, origin: Array, cell: float, best: Array, distance: Array, x: int, y: int, z: int, step: int
 ) -> None:
@@ -91,7 +93,7 @@ def _take_from_neighbours(
         _offer(points, origin, cell, best, distance, best[x, y, z + step], x, y, z)
 
 
-@njit(nogil=True, cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@njit(nogil=True, cache=True, error_model="numpy")
 def _offer(
     points: Array, origin: Array, cell: float, best: Array, distance: Array, k: int, x: int, y: int, z: int
 ) -> None:
@@ -102,3 +104,123 @@ def _offer(
     if d < distance[x, y, z]:
         distance[x, y, z] = d
         best[x, y, z] = k
+
+
+class Surface(NamedTuple):
+    """The body's points and grids, all links one after the other (L links, M points, C grid cells).
+
+    ``points, normals`` (M, 3) float32 [m, link frame]; ``weights`` (M,) float32 0..1: how rigidly it follows;
+    ``first_point`` (L,) int64; ``origin`` (L, 3) float32 [m]; ``shape`` (L, 3) int64; ``cells_per_m`` (L,) float32;
+    ``first_cell`` (L,) int64; ``nearest`` (C,) int16, see ``closest_point_grid``;
+    ``low, high`` (L, 3) float32 [m, link frame]: box around the link's points; low > high when it has none.
+    """
+
+    points: Array
+    normals: Array
+    weights: Array
+    first_point: Array
+    origin: Array
+    shape: Array
+    cells_per_m: Array
+    first_cell: Array
+    nearest: Array
+    low: Array
+    high: Array
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def near_links(points: Array, R: Array, t: Array, surface: Surface, gate: float, near: Array) -> None:
+    """Fills ``near`` (N, NEAR_LINKS) int8 with the links whose box, grown by the gate, holds the point; -1 ends."""
+    near[:, 0] = -1
+    fill = np.zeros(len(points), np.int64)
+    for link in range(len(R)):
+        if surface.low[link, 0] > surface.high[link, 0]:
+            continue
+        cx = 0.5 * (surface.low[link, 0] + surface.high[link, 0])
+        cy = 0.5 * (surface.low[link, 1] + surface.high[link, 1])
+        cz = 0.5 * (surface.low[link, 2] + surface.high[link, 2])
+        hx = surface.high[link, 0] - cx + gate
+        hy = surface.high[link, 1] - cy + gate
+        hz = surface.high[link, 2] - cz + gate
+        x = t[link, 0] + R[link, 0, 0] * cx + R[link, 0, 1] * cy + R[link, 0, 2] * cz
+        y = t[link, 1] + R[link, 1, 0] * cx + R[link, 1, 1] * cy + R[link, 1, 2] * cz
+        z = t[link, 2] + R[link, 2, 0] * cx + R[link, 2, 1] * cy + R[link, 2, 2] * cz
+        for n in range(len(points)):
+            dx, dy, dz = points[n, 0] - x, points[n, 1] - y, points[n, 2] - z
+            if (
+                abs(R[link, 0, 0] * dx + R[link, 1, 0] * dy + R[link, 2, 0] * dz) < hx
+                and abs(R[link, 0, 1] * dx + R[link, 1, 1] * dy + R[link, 2, 1] * dz) < hy
+                and abs(R[link, 0, 2] * dx + R[link, 1, 2] * dy + R[link, 2, 2] * dz) < hz
+                and fill[n] < NEAR_LINKS
+            ):
+                near[n, fill[n]] = link
+                fill[n] += 1
+                if fill[n] < NEAR_LINKS:
+                    near[n, fill[n]] = -1
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _closest_point(
+    points: Array, normals: Array, near: Array, n: int, R: Array, t: Array, surface: Surface
+) -> tuple[int, int, np.float32]:
+    """Of point n: link, row and squared distance [m²] of the closest compatible model point; link -1: there is none."""
+    zero = np.float32(0.0)  # single precision throughout: this is where the time goes
+    best_link, best_point, best = -1, -1, np.float32(np.inf)
+    for c in range(near.shape[1]):
+        link = int(near[n, c])
+        if link < 0:
+            break
+        dx, dy, dz = points[n, 0] - t[link, 0], points[n, 1] - t[link, 1], points[n, 2] - t[link, 2]
+        qx = R[link, 0, 0] * dx + R[link, 1, 0] * dy + R[link, 2, 0] * dz
+        qy = R[link, 0, 1] * dx + R[link, 1, 1] * dy + R[link, 2, 1] * dz
+        qz = R[link, 0, 2] * dx + R[link, 1, 2] * dy + R[link, 2, 2] * dz
+        ux = max(surface.low[link, 0] - qx, qx - surface.high[link, 0], zero)
+        uy = max(surface.low[link, 1] - qy, qy - surface.high[link, 1], zero)
+        uz = max(surface.low[link, 2] - qz, qz - surface.high[link, 2], zero)
+        d = ux * ux + uy * uy + uz * uz  # from the box of the link's points: none of them can be closer
+        if d >= best:
+            continue
+        mx = R[link, 0, 0] * normals[n, 0] + R[link, 1, 0] * normals[n, 1] + R[link, 2, 0] * normals[n, 2]
+        my = R[link, 0, 1] * normals[n, 0] + R[link, 1, 1] * normals[n, 1] + R[link, 2, 1] * normals[n, 2]
+        mz = R[link, 0, 2] * normals[n, 0] + R[link, 1, 2] * normals[n, 1] + R[link, 2, 2] * normals[n, 2]
+        ax, ay, az = abs(mx), abs(my), abs(mz)
+        if ax >= ay and ax >= az:
+            side = 0 if mx > 0 else 1
+        elif ay >= az:
+            side = 2 if my > 0 else 3
+        else:
+            side = 4 if mz > 0 else 5
+        nx, ny, nz = surface.shape[link, 0], surface.shape[link, 1], surface.shape[link, 2]
+        cell = surface.cells_per_m[link]
+        x = min(max(int((qx - surface.origin[link, 0]) * cell), 0), nx - 1)
+        y = min(max(int((qy - surface.origin[link, 1]) * cell), 0), ny - 1)
+        z = min(max(int((qz - surface.origin[link, 2]) * cell), 0), nz - 1)
+        k = int(surface.nearest[surface.first_cell[link] + ((side * nx + x) * ny + y) * nz + z])
+        if k < 0:
+            continue
+        k += surface.first_point[link]
+        ex, ey, ez = qx - surface.points[k, 0], qy - surface.points[k, 1], qz - surface.points[k, 2]
+        d = ex * ex + ey * ey + ez * ez
+        if d >= best:
+            continue
+        if mx * surface.normals[k, 0] + my * surface.normals[k, 1] + mz * surface.normals[k, 2] < NORMAL_GATE:
+            continue
+        best_link, best_point, best = link, k, d
+    return best_link, best_point, best
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def match_points(
+    points: Array, normals: Array, near: Array, R: Array, t: Array, surface: Surface, link: Array, row: Array, d2: Array
+) -> None:
+    """Closest compatible model point of every point (N, 3): fills ``link`` (N,) int64 (-1: none), ``row`` (N,) int64
+    and the squared distance ``d2`` (N,) [m²]; ``R, t``: link frames in the world, from ``forward``."""
+    R32, t32 = R.astype(np.float32), t.astype(np.float32)
+    for n in range(len(points)):
+        link[n], row[n], d2[n] = _closest_point(points, normals, near, n, R32, t32, surface)
+        for c in range(1, near.shape[1]):  # asked first next time: its short distance rules the other boxes out
+            if near[n, c] < 0 or link[n] < 0:
+                break
+            if near[n, c] == link[n]:
+                near[n, 0], near[n, c] = near[n, c], near[n, 0]
+                break

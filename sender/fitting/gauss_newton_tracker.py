@@ -1,4 +1,4 @@
-"""The default pose tracker: finds a person, learns their surface, follows them with Gauss–Newton (algorithms.md §3, §8).
+"""The default pose tracker: finds a person, learns their surface and follows them with Gauss–Newton.
 
 Looking → building (the first second after the start pose: the surface is gathered) → tracking → looking again after
 the person was lost for a while. Everything depends only on the clouds and their capture times.
@@ -16,11 +16,12 @@ from common.body.skeleton import LINK_COUNT, LINK_INDEX, Skeleton
 from common.body.skeleton_pose import SkeletonPose, forward_kinematics
 from common.geometry import quaternion
 from common.geometry.point_cloud import PointCloud
-from sender.fitting.articulated_gauss_newton import FitArrays, PoseState, Schedule, fit_pose, forward, judge_pose
+from sender.fitting.articulated_gauss_newton import FitArrays, PoseState, Schedule, forward
+from sender.fitting.body_fitter import BodyFitter
 from sender.fitting.body_model import BodyModel
 from sender.fitting.initial_pose import NoPose, find_initial_pose
 from sender.fitting.joint_limits import joint_table
-from sender.fitting.limb_search import Limb, limbs, nearby_poses, score_poses, with_limb
+from sender.fitting.limb_search import Limb, limbs, search_limb, thinned, within_reach
 from sender.fitting.tracker import FitResult
 from sender.fitting.whole_body_search import WholeBodySearch
 
@@ -46,7 +47,7 @@ HYPOTHESES = (1.0, 0.5, 0.0)  # shares of the last velocity
 GUESS = Schedule(3, 0.20, 0.10, 0.2, 1.0, 1.0)
 COARSE = Schedule(2, 0.15, 0.08, 0.1, 1.0, 1.0)
 FINE = Schedule(2, 0.08, 0.06, 0.1, 1.0, 1.0)
-LIMB = Schedule(5, 0.12, 0.06, 0.1, 3.0, 1.0)
+GUESS_POINTS, COARSE_POINTS = 250, 800
 LEARN_EVERY = 3
 RETRY_FRAMES = 5  # after a limb search in vain
 _FOLLOWS = {"fingers": "hand", "toes": "foot"}
@@ -68,7 +69,6 @@ class GaussNewtonTracker:
         self._result: FitResult | None = None
         self._building_until_ns: int | None = None
         self._good_ns = 0
-        self.searches = 0
         self._frames = 0
         self._retry_after = np.zeros(LINK_COUNT, np.int64)
         self._status = "looking for a person"
@@ -92,7 +92,7 @@ class GaussNewtonTracker:
         self._times_ns = (capture_ns, capture_ns)
         self._building_until_ns = capture_ns + int(self._settings.building_s * 1e9)
         self._good_ns = capture_ns
-        fit = self._judge(cloud, self._state)
+        fit = self._fitter().judge(cloud, self._state)
         return self._accept(fit, cloud, capture_ns)
 
     def track(self, cloud: PointCloud, capture_ns: int) -> FitResult | None:
@@ -128,19 +128,20 @@ class GaussNewtonTracker:
         self._times_ns = (capture_ns, capture_ns)
         self._good_ns = capture_ns
         self._search = WholeBodySearch(self._body, self._table)
-        return self._accept(self._judge(cloud, fit.pose), cloud, capture_ns)
+        return self._accept(self._fitter().judge(cloud, fit.pose), cloud, capture_ns)
 
     def _follow(self, cloud: PointCloud, capture_ns: int) -> FitArrays:
         """Velocity hypotheses on a tenth of the points, coarse then fine fit of the best, limbs that got lost."""
-        some = _every(cloud, max(len(cloud) // 250, 1))
+        fitter = self._fitter()
+        some = thinned(cloud, GUESS_POINTS)
         guesses = [self._predicted(share, capture_ns) for share in HYPOTHESES]
-        fits = [self._fit(some, guess, guess, GUESS) for guess in guesses]
+        fits = [fitter.fit(some, guess, guess, GUESS) for guess in guesses]
         best = min(range(len(fits)), key=lambda k: fits[k].score)
         predicted = guesses[best]
-        fit = self._fit(_every(cloud, 3), fits[best].pose, predicted, COARSE)
-        fit = self._fit(cloud, fit.pose, predicted, FINE)
+        fit = fitter.fit(thinned(cloud, COARSE_POINTS), fits[best].pose, predicted, COARSE)
+        fit = fitter.fit(cloud, fit.pose, predicted, FINE)
         for limb in self._limbs:
-            fit = self._search_limb(limb, fit, cloud)
+            fit = self._found_limb(limb, fit, cloud)
         return fit
 
     def _predicted(self, share: float, capture_ns: int) -> PoseState:
@@ -157,62 +158,31 @@ class GaussNewtonTracker:
         step = quaternion.to_matrix(quaternion.from_rotation_vector(ahead * turn))
         return PoseState(now.root + ahead * (now.root - before.root), now.local @ step)
 
-    def _fit(self, cloud: PointCloud, start: PoseState, predicted: PoseState, plan: Schedule) -> FitArrays:
-        body = self._known_body()
-        offsets = body.skeleton.offsets.astype(np.float64)
-        return fit_pose(cloud.positions, cloud.normals, start, predicted, offsets, body.surface(0), self._table, plan)
-
-    def _judge(self, cloud: PointCloud, state: PoseState) -> FitArrays:
-        body = self._known_body()
-        offsets = body.skeleton.offsets.astype(np.float64)
-        return judge_pose(cloud.positions, cloud.normals, state, offsets, body.surface(0), self._table)
+    def _fitter(self) -> BodyFitter:
+        return BodyFitter(self._known_body(), self._table)
 
     def _known_body(self) -> BodyModel:
         assert self._body is not None
         return self._body
 
-    def _search_limb(self, limb: Limb, fit: FitArrays, cloud: PointCloud) -> FitArrays:
-        """The best of the fit and its retries with the limb as it was, turned, or anywhere; tried when the limb explains
-        much less than usual while points it could explain are left over."""
-        assert self._state is not None
+    def _found_limb(self, limb: Limb, fit: FitArrays, cloud: PointCloud) -> FitArrays:
+        """The fit, or a better one when the limb explains much less than usual while points within its reach, which it
+        could explain, are left over."""
         outer = limb.links[1:]
         usual = self._usual[outer].sum() * len(cloud)
-        if fit.explained[outer].sum() > 0.4 * usual or self._frames < self._retry_after[limb.links[0]]:
+        if fit.explained[outer].sum() > 0.4 * usual or self._frames < self._retry_after[outer[0]]:
             return fit
-        body = self._known_body()
-        offsets = body.skeleton.offsets.astype(np.float64)
-        R, t = forward(fit.pose.root, fit.pose.local, offsets, self._table.parents)
-        reach = np.linalg.norm(offsets[outer], axis=1).sum() + 0.25
-        near = np.linalg.norm(cloud.positions - t[limb.links[0]].astype(np.float32), axis=1) < reach
-        if (near & (fit.owner < 0)).sum() < 0.4 * usual:
+        assert self._state is not None
+        fitter = self._fitter()
+        _, joints = forward(fit.pose.root, fit.pose.local, fitter.offsets, self._table.parents)
+        left_over = within_reach(limb, joints, fitter.offsets, cloud) & (fit.owner < 0)
+        if left_over.sum() < 0.4 * usual:
             return fit
-        self.searches += 1
-        rows = np.flatnonzero(near & ((fit.owner < 0) | np.isin(fit.owner, limb.links)))
-        rows = rows[:: max(len(rows) // 60, 1)]
-        poses = np.concatenate(
-            [
-                fit.pose.local[limb.links][None],
-                self._state.local[limb.links][None],
-                nearby_poses(limb, fit.pose.local, self._table),
-                nearby_poses(limb, self._state.local, self._table),
-                limb.poses,
-            ]
-        )
-        costs = score_poses(
-            cloud.positions[rows], cloud.normals[rows], R, t, limb.links, poses, offsets, body.surface(0),
-            self._table.parents,
-        )  # fmt: skip
-        some = _every(cloud, 4)
-        retries = [fit]
-        for k in np.argsort(costs, kind="stable")[:3]:
-            start = with_limb(fit.pose, limb, poses[k])
-            retries.append(self._fit(some, start, start, LIMB))
-        scores = [self._judge(some, retry.pose).score for retry in retries]
-        best = int(np.argmin(scores))
-        if scores[best] > 0.96 * scores[0]:
-            self._retry_after[limb.links[0]] = self._frames + RETRY_FRAMES
+        found = search_limb(limb, fit, cloud, fitter, (self._state,))
+        if found is fit.pose:
+            self._retry_after[outer[0]] = self._frames + RETRY_FRAMES
             return fit
-        return self._fit(cloud, retries[best].pose, retries[best].pose, FINE)
+        return fitter.fit(cloud, found, found, FINE)
 
     def _accept(self, fit: FitArrays, cloud: PointCloud, capture_ns: int) -> FitResult:
         """Takes the fit as the new state, lets the model learn from it, and says how it went."""
@@ -268,12 +238,4 @@ class GaussNewtonTracker:
 
 
 def _state_of(pose: SkeletonPose) -> PoseState:
-    return PoseState(
-        pose.root_position.astype(np.float64), quaternion.to_matrix(pose.rotations.astype(np.float64))
-    )
-
-
-def _every(cloud: PointCloud, step: int) -> PointCloud:
-    if step <= 1:
-        return cloud
-    return PointCloud(cloud.positions[::step].copy(), cloud.normals[::step].copy(), cloud.colours[::step].copy())
+    return PoseState(pose.root_position.astype(np.float64), quaternion.to_matrix(pose.rotations.astype(np.float64)))

@@ -37,9 +37,9 @@ POINTS_OF_A_SEEN_LINK = 8.0
 ON_FLOOR_M = 0.3  # a cloud that ends higher above the floor shows no feet
 LEAST_STATURE_M = 1.1  # where the floor is not known, what is lower is taken for an upper body
 AVERAGE_STATURE_M = 1.70
-# Angles to start from: (between upper arm and trunk, elbow): hanging, A-pose, T-pose; hanging, forearms on a table.
+# Angles to start from: (between upper arm and trunk, elbow): hanging, A-pose, T-pose; hanging, out, typing.
 STANDING_ARMS_RAD = ((0.25, 0.3), (0.8, 0.3), (1.45, 0.3))
-SITTING_ARMS_RAD = ((0.25, 0.3), (0.25, 1.3))
+SITTING_ARMS_RAD = ((0.25, 0.3), (0.8, 0.3), (0.25, 1.3))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -127,9 +127,10 @@ def _upper_body_outline(points: Floats, normals: Floats, top: float, camera_side
     if person.sum() < MINIMUM_POINTS:
         return NoPose(f"{person.sum()} points around a head, at least {MINIMUM_POINTS} are needed")
     reaching = person & (below > 0.2 * AVERAGE_STATURE_M) & (aside > 0.2 * AVERAGE_STATURE_M)
+    reach = points[reaching][:, [0, 2]].sum(axis=0) - reaching.sum() * middle  # of both arms together
     facing, turns_deg = camera_side, (-45.0, -15.0, 15.0, 45.0)
-    if reaching.mean() > 0.1:  # arms reach forwards, whichever side the camera sees
-        facing, turns_deg = points[reaching][:, [0, 2]].mean(axis=0) - middle, (-30.0, -10.0, 10.0, 30.0)
+    if np.linalg.norm(reach) > 0.007 * AVERAGE_STATURE_M * len(points):
+        facing, turns_deg = reach, (-30.0, -10.0, 10.0, 30.0)  # arms reach forwards, whichever side the camera sees
     headings = tuple(float(np.arctan2(facing[0], facing[1]) + np.deg2rad(turn)) for turn in turns_deg)
     return _Outline(top - AVERAGE_STATURE_M, AVERAGE_STATURE_M, False, middle, headings, person)
 

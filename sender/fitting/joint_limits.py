@@ -11,12 +11,15 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from common.body.skeleton import LINK_COUNT, LINK_NAMES, LINK_PARENTS, SIDES
 
 Array = NDArray[Any]
 
+LIMIT_SIGMA = 0.06  # rad beyond a joint limit
+ROOT_STEP_M = 0.10  # standard deviation of the change of the root's position in 1/30 s
 X, Y = 0, 1  # twist axes: arms lie along x at rest, everything else roughly along y
 
 # link: (twist axis, lowest angles [deg], highest angles [deg], spread about rest [deg], change from frame to frame [deg])
@@ -90,3 +93,129 @@ def _ancestors() -> Array:
     for link in range(1, LINK_COUNT):
         above[:, link] |= above[:, LINK_PARENTS[link]]
     return above
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def add_priors(
+    root: Array,
+    local: Array,
+    predicted_root: Array,
+    predicted_local: Array,
+    table: JointTable,
+    step_scale: float,
+    damping: float,
+    A: Array,
+    b: Array,
+) -> None:
+    """Adds to the normal equations A (6+D, 6+D), b (6+D,) what holds every axis near the prediction, near rest, and
+    within its limits (the root only near the prediction); ``root`` (3,) [m], ``local`` (L, 3, 3): the pose now."""
+    off, angles, turned = np.empty(3), np.empty(3), np.empty(3)
+    M = np.empty((3, 3))
+    last = -1
+    k = 1.0 / (ROOT_STEP_M * step_scale) ** 2
+    for i in range(3):
+        A[3 + i, 3 + i] += k + damping * 10
+        b[3 + i] += k * (predicted_root[i] - root[i])
+        A[i, i] += 1.0 / (table.step[0, i] * step_scale) ** 2 + damping
+    for d in range(len(table.dof_link)):
+        link, axis, row = table.dof_link[d], table.dof_axis[d], 6 + d
+        if link != last:
+            M[:] = 0.0
+            for i in range(3):
+                for j in range(3):
+                    for k in range(3):
+                        M[i, j] += local[link, k, i] * predicted_local[link, k, j]
+            rotation_log(M, off)  # from the state to the prediction, in the link's frame
+            swing_twist_angles(local[link], table.twist_axis[link], angles)
+            last = link
+            _to_link_axes(angles, table.twist_axis[link], turned)
+        k = 1.0 / (table.step[link, axis] * step_scale) ** 2
+        A[row, row] += k + damping
+        b[row] += k * off[axis]
+        k = 1.0 / table.spread[link, axis] ** 2
+        A[row, row] += k
+        b[row] -= k * turned[axis]
+        beyond = max(angles[axis] - table.high[link, axis], 0.0) + min(angles[axis] - table.low[link, axis], 0.0)
+        if beyond != 0.0:
+            k = 1.0 / LIMIT_SIGMA**2
+            _push_back(A, b, row, d, table, link, axis, angles[table.twist_axis[link]], k, beyond)
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _to_link_axes(angles: Array, axis: int, turned: Array) -> None:
+    """Swing components as the turning link's own axes see them: turned back by the twist."""
+    i, j = (axis + 1) % 3, (axis + 2) % 3
+    c, s = np.cos(angles[axis]), np.sin(angles[axis])
+    turned[axis] = angles[axis]
+    turned[i], turned[j] = c * angles[i] + s * angles[j], c * angles[j] - s * angles[i]
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _push_back(
+    A: Array,
+    b: Array,
+    row: int,
+    d: int,
+    table: JointTable,
+    link: int,
+    axis: int,
+    twist: float,
+    k: float,
+    beyond: float,
+) -> None:
+    """Adds one limit, a plane in angle space; a swing component moves with both of the link's own swing axes."""
+    twist_axis = table.twist_axis[link]
+    grad = np.zeros(3)
+    if axis == twist_axis:
+        grad[axis] = 1.0
+    else:
+        i, j = (twist_axis + 1) % 3, (twist_axis + 2) % 3
+        c, s = np.cos(twist), np.sin(twist)
+        grad[i], grad[j] = (c, -s) if axis == i else (s, c)
+    first = row - axis  # free axes of a link are stored together: all three or none
+    for i in range(3):
+        b[first + i] -= k * grad[i] * beyond
+        for j in range(3):
+            A[first + i, first + j] += k * grad[i] * grad[j]
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def rotation_log(M: Array, v: Array) -> None:
+    """Writes the rotation vector (3,) [rad] of M (3, 3) into ``v``; near a half turn the axis is only approximate."""
+    x, y, z = M[2, 1] - M[1, 2], M[0, 2] - M[2, 0], M[1, 0] - M[0, 1]
+    s = np.sqrt(x * x + y * y + z * z)
+    angle = np.arctan2(s, M[0, 0] + M[1, 1] + M[2, 2] - 1.0)
+    f = angle / s if s > 1e-9 else 0.5
+    v[0], v[1], v[2] = f * x, f * y, f * z
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def rotation_exp(v: Array, M: Array) -> None:
+    """Writes the rotation matrix (3, 3) of the rotation vector ``v`` (3,) [rad] into M (Rodrigues)."""
+    angle = np.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2])
+    f = np.sin(angle) / angle if angle > 1e-9 else 1.0
+    h = (1.0 - np.cos(angle)) / (angle * angle) if angle > 1e-9 else 0.5
+    c = np.cos(angle)
+    M[0, 0], M[0, 1], M[0, 2] = c + h * v[0] * v[0], h * v[0] * v[1] - f * v[2], h * v[0] * v[2] + f * v[1]
+    M[1, 0], M[1, 1], M[1, 2] = h * v[0] * v[1] + f * v[2], c + h * v[1] * v[1], h * v[1] * v[2] - f * v[0]
+    M[2, 0], M[2, 1], M[2, 2] = h * v[0] * v[2] - f * v[1], h * v[1] * v[2] + f * v[0], c + h * v[2] * v[2]
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def swing_twist_angles(M: Array, axis: int, v: Array) -> None:
+    """Writes into ``v`` (3,) [rad]: at ``axis`` the twist about it, elsewhere the swing's rotation vector."""
+    w = np.sqrt(max(1.0 + M[0, 0] + M[1, 1] + M[2, 2], 1e-12)) * 0.5
+    q = np.empty(3)
+    q[0], q[1], q[2] = M[2, 1] - M[1, 2], M[0, 2] - M[2, 0], M[1, 0] - M[0, 1]
+    q /= 4.0 * w
+    n = np.sqrt(w * w + q[axis] * q[axis])
+    if n < 1e-6:
+        v[:] = 0.0
+        return
+    cw, cx = w / n, q[axis] / n
+    i, j = (axis + 1) % 3, (axis + 2) % 3
+    si, sj = cw * q[i] - cx * q[j], cw * q[j] + cx * q[i]  # swing = q · twist⁻¹; its component at the axis is 0
+    s = np.sqrt(si * si + sj * sj)
+    f = 2.0 * np.arctan2(s, n) / s if s > 1e-9 else 2.0
+    v[axis] = 2.0 * np.arctan2(cx, cw)
+    v[i], v[j] = f * si, f * sj

@@ -15,12 +15,24 @@ from numpy.typing import NDArray
 
 from common.body.skeleton import LINK_INDEX, SIDES
 from common.geometry import quaternion
-from sender.fitting.articulated_gauss_newton import INLIER_M, PoseState, Surface, match_points
+from common.geometry.point_cloud import PointCloud
+from sender.fitting.articulated_gauss_newton import (
+    INLIER_M,
+    FitArrays,
+    PoseState,
+    Schedule,
+    forward,
+)
+from sender.fitting.body_fitter import BodyFitter
+from sender.fitting.closest_point_grid import Surface, match_points
 from sender.fitting.joint_limits import JointTable
 
 Array = NDArray[Any]
 
 _SWINGS, _TWISTS, _BENDS = 6, 5, 4  # samples per angle range
+SCORED_POINTS, RETRY_POINTS, RETRIES = 50, 600, 3
+RETRY = Schedule(5, 0.12, 0.06, 0.1, 3.0, 1.0)
+CLEARLY_BETTER = 0.96  # of the score without the retry
 _HINGE = {"forearm": 1, "shin": 0}  # axis about which the middle joint bends
 
 
@@ -76,16 +88,70 @@ def nearby_poses(limb: Limb, local: Array, table: JointTable) -> Array:
     return out.reshape(-1, 3, 3, 3)
 
 
-def with_limb(state: PoseState, limb: Limb, pose: Array) -> PoseState:
-    """``state`` with the limb's local rotations replaced by ``pose`` (3, 3, 3)."""
+def search_limb(
+    limb: Limb, fit: FitArrays, cloud: PointCloud, fitter: BodyFitter, also: tuple[PoseState, ...]
+) -> PoseState:
+    """The best of ``fit`` and its retries with the limb turned, as it is in ``also``, or anywhere; ``fit.pose`` itself
+    when nothing explains the cloud clearly better."""
+    R, t = forward(fit.pose.root, fit.pose.local, fitter.offsets, fitter.table.parents)
+    rows = np.flatnonzero(within_reach(limb, t, fitter.offsets, cloud) & _free(limb, fit))
+    if len(rows) < 10:
+        return fit.pose
+    rows = rows[:: max(len(rows) // SCORED_POINTS, 1)]
+    states = (fit.pose, *also)
+    known = [state.local[limb.links][None] for state in states]
+    turned = [nearby_poses(limb, state.local, fitter.table) for state in states]
+    poses = np.concatenate([*known, *turned, limb.poses])
+    costs = score_poses(
+        cloud.positions[rows], cloud.normals[rows], R, t, limb.links, poses, fitter.offsets, fitter.surface,
+        fitter.table.parents,
+    )  # fmt: skip
+    some = thinned(cloud, RETRY_POINTS)
+    best, best_score = fit.pose, CLEARLY_BETTER * fitter.judge(some, fit.pose).score
+    for k in np.argsort(costs, kind="stable")[:RETRIES]:
+        start = _with_limb(fit.pose, limb, poses[k])
+        retry = fitter.fit(some, start, start, RETRY)
+        if retry.score < best_score:
+            best, best_score = retry.pose, retry.score
+    return best
+
+
+def within_reach(limb: Limb, joints: Array, offsets: Array, cloud: PointCloud) -> Array:
+    """Points (N,) bool that the limb could touch; ``joints, offsets`` (L, 3) [m]."""
+    reach = np.linalg.norm(offsets[limb.links[1:]], axis=1).sum() + 0.25
+    near: Array = np.linalg.norm(cloud.positions - joints[limb.links[0]].astype(np.float32), axis=1) < reach
+    return near
+
+
+def _free(limb: Limb, fit: FitArrays) -> Array:
+    free: Array = (fit.owner < 0) | np.isin(fit.owner, limb.links)
+    return free
+
+
+def _with_limb(state: PoseState, limb: Limb, pose: Array) -> PoseState:
     local = state.local.copy()
     local[limb.links] = pose
     return PoseState(state.root, local)
 
 
-@njit(nogil=True, cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+def thinned(cloud: PointCloud, count: int) -> PointCloud:
+    """Every n-th point, so that about ``count`` (at most twice as many) remain."""
+    step = max(len(cloud) // count, 1)
+    if step == 1:
+        return cloud
+    return PointCloud(cloud.positions[::step].copy(), cloud.normals[::step].copy(), cloud.colours[::step].copy())
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
 def score_poses(
-    points: Array, normals: Array, R: Array, t: Array, links: Array, poses: Array, offsets: Array, surface: Surface,
+    points: Array,
+    normals: Array,
+    R: Array,
+    t: Array,
+    links: Array,
+    poses: Array,
+    offsets: Array,
+    surface: Surface,
     parents: Array,
 ) -> Array:
     """Mean robust cost (K,) 0..1 of ``points, normals`` (N, 3) [m, world] against one limb in each of ``poses``

@@ -1,0 +1,83 @@
+"""Real daemons, real Zenoh, real signals: a person gets through, and comes back after either end was killed."""
+
+from __future__ import annotations
+
+import signal
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from receiver.show_log import read_show_log
+from tests.daemon_processes import Site, site
+
+SHOWN, PUBLISHED = "telepose_frames_shown_total", "telepose_skeletons_published_total"
+POSES = "telepose_repository_poses"
+SMALL_RIG = ("--width", "320", "--height", "240", "--fps", "15")  # leaves the test machine time for the rest
+
+
+@pytest.fixture
+def here(tmp_path: Path) -> Iterator[Site]:
+    with site(tmp_path) as made:
+        yield made
+
+
+def test_a_person_gets_through_and_both_ends_leave_cleanly(here):
+    log = here.folder / "shown.log"
+    receiver = here.receiver("--log-shown", str(log))  # first: it waits for its sender
+    here.rig(*SMALL_RIG)
+    sender = here.sender()
+    receiver.wait_for(POSES, 1)
+    receiver.wait_for(SHOWN, 30)
+    assert receiver.get("/healthz") == (200, "ok\n")
+    assert receiver.get("/readyz") == (200, "ok\n")
+    for daemon in (sender, receiver):
+        code, seconds = daemon.end()
+        assert code == 0, daemon.log
+        assert seconds < 2.5
+    assert here.figures("sender")["skeleton_bytes_max"] <= 250
+    kinds = {kind for kind, _, _ in read_show_log(log)}
+    assert kinds == {"skeleton", "body", "pose", "frame", "tick"}
+
+
+def test_a_killed_receiver_comes_back_to_the_picture(here):
+    here.rig(*SMALL_RIG)
+    here.sender()
+    first = here.receiver()
+    first.wait_for(POSES, 1)
+    first.end(signal.SIGKILL)
+    second = here.receiver(name="again")
+    second.wait_for(POSES, 1)  # handed what the sender has, body included
+    second.wait_for(SHOWN, 10)
+
+
+def test_a_killed_sender_goes_on_in_mid_motion(here):
+    here.rig(*SMALL_RIG)
+    receiver = here.receiver()
+    sender = here.sender()
+    receiver.wait_for(POSES, 1)
+    body = here.folder / "studio-0.body"
+    sender.wait_for(PUBLISHED, 60)
+    assert body.exists()
+    sender.end(signal.SIGKILL)
+    shown = receiver.metric(SHOWN)
+    here.sender()
+    receiver.wait_for(SHOWN, shown + 20)  # the A-pose is over, so this takes the body that was kept
+    receiver.wait_for(POSES, 1)
+
+
+def test_ctrl_c_ends_a_receiver_that_never_found_its_sender(here):
+    receiver = here.receiver()
+    receiver.wait_for("telepose_frames_shown_total", 0)
+    while receiver.get("/healthz")[0] != 200:
+        assert receiver.process.poll() is None
+    assert receiver.get("/readyz")[0] == 503
+    code, seconds = receiver.end(signal.SIGINT)
+    assert (code, seconds < 2.5) == (0, True)
+
+
+def test_a_recording_that_is_not_there_is_an_error_in_one_line(here):
+    sender = here.sender("--recording", str(here.folder / "nowhere"))
+    assert sender.process.wait(30) == 1
+    assert "nowhere" in sender.log.strip().splitlines()[-1]
+    assert "Traceback" not in sender.log
