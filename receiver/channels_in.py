@@ -6,7 +6,6 @@ is made of it.
 
 from __future__ import annotations
 
-import struct
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -20,6 +19,7 @@ from common.transport.channel_query import ask
 from common.transport.channel_subscriber import Arrival, ChannelSubscriber
 from common.transport.channels import Channel, channel_key
 from common.transport.chunks import ChunkAssembler, decode_chunk
+from common.transport.clock_exchange import exchange_times
 from common.transport.clock_offset import ClockOffset
 from common.transport.zenoh_session import ZenohSession
 from common.wire.body_message import decode_body
@@ -27,8 +27,6 @@ from common.wire.header import WireError
 from common.wire.receiver_report import ReceiverReport, encode_report
 from common.wire.skeleton_packet import SkeletonPacket, decode_skeleton
 from receiver.skeleton_buffer import SkeletonBuffer
-
-CLOCK_ANSWER = struct.Struct("<q")  # the sender's monotonic time [ns]
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,7 +98,7 @@ class ReceiverChannels:
             receiver_epoch=self._epoch,
             sender_epoch=self._arrivals.epoch if self._arrivals.epoch is not None else newest.epoch if newest else None,
             clock_ns=now_ns,
-            skeleton_send_ns=newest.capture_ns if newest else None,
+            skeleton_send_ns=newest.send_ns if newest else None,
             skeleton_hold_ns=max(now_ns - self._skeleton_arrival_ns, 0) if newest else 0,
             skeleton_delay_ns=self._skeleton_delay.take(),
             bulk_delay_ns=self._bulk_delay.take(),
@@ -114,13 +112,7 @@ class ReceiverChannels:
 
     async def ask_time(self) -> None:
         """One exchange of times with the sender."""
-        sent_ns = self._clock.now_ns()
-        answers = await ask(self._session, channels.CLOCK, self._key(channels.CLOCK), timeout_s=0.5)
-        if len(answers) == 1 and len(answers[0]) == CLOCK_ANSWER.size:
-            (remote_ns,) = CLOCK_ANSWER.unpack(answers[0])
-            self.clock_offset.add(sent_ns, remote_ns, remote_ns, self._clock.now_ns())
-        elif answers:
-            self.counts["clock answer refused"] += 1
+        await exchange_times(self._session, self._key(channels.CLOCK), self._clock, self.clock_offset, timeout_s=0.5)
 
     async def ask_body(self) -> None:
         """Ask for the person's sizes, which are published only when they change."""
@@ -152,7 +144,7 @@ class ReceiverChannels:
             self.clock_offset.forget()
             self._handlers.epoch()
         self._skeleton_arrival_ns = arrival.arrival_ns
-        self._skeleton_delay.note(packet.capture_ns, arrival.arrival_ns)
+        self._skeleton_delay.note(packet.send_ns, arrival.arrival_ns)
         if self._knows(packet):
             self._handlers.skeleton(packet, self._bodies.by_revision[packet.body_revision], arrival.payload)
         else:

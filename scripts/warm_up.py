@@ -47,7 +47,8 @@ def skeleton_path(renderer: RigRenderer, tracker: GaussNewtonTracker, timer: Sta
     """The sender's fast path before the rig's cameras."""
     rooms = [renderer.empty_room(index) for index in range(len(renderer.cameras))]
     backgrounds = [BackgroundModel(c, room) for c, room in zip(renderer.cameras, rooms, strict=True)]
-    return SkeletonPath(StreamIdentity(0, 1), backgrounds, PointSampler(renderer.cameras), tracker, RATE_HZ, timer)
+    sampler, clock = PointSampler(renderer.cameras), MonotonicClock()
+    return SkeletonPath(StreamIdentity(0, 1), backgrounds, sampler, tracker, RATE_HZ, timer, clock)
 
 
 def main() -> None:

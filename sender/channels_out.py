@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import struct
 from collections.abc import Callable
 
 from common.runtime.clock import Clock
@@ -11,9 +10,8 @@ from common.transport.channel_publisher import ChannelPublisher
 from common.transport.channel_query import ChannelQueryable
 from common.transport.channel_subscriber import Arrival, ChannelSubscriber
 from common.transport.channels import ANY, Channel, channel_key
+from common.transport.clock_exchange import serve_clock
 from common.transport.zenoh_session import ZenohSession
-
-CLOCK_ANSWER = struct.Struct("<q")  # the sender's monotonic time [ns]
 
 
 class SenderChannels:
@@ -34,7 +32,7 @@ class SenderChannels:
         session = self._session
         ChannelQueryable(session, channels.BODY, self._key(channels.BODY), lambda _: self._body_message)
         ChannelQueryable(session, channels.STATUS, self._key(channels.STATUS), lambda _: status())
-        ChannelQueryable(session, channels.CLOCK, self._key(channels.CLOCK), self._tell_time)
+        serve_clock(session, self._key(channels.CLOCK), self._clock)
         key = self._key(channels.REPORT, ANY)
         self.reports = ChannelSubscriber(session, channels.REPORT, key, on_report, self._clock)
         session.declare_presence(self._key(channels.SENDER_PRESENCE))
@@ -51,9 +49,6 @@ class SenderChannels:
     def bulk_publisher(self, receiver: str) -> ChannelPublisher:
         """The bulk channel of one receiver."""
         return ChannelPublisher(self._session, channels.BULK, self._key(channels.BULK, receiver))
-
-    def _tell_time(self, _: bytes) -> bytes:
-        return CLOCK_ANSWER.pack(self._clock.now_ns())
 
     def _key(self, channel: Channel, receiver: str | None = None) -> str:
         return channel_key(channel, self._site, self._person, receiver)

@@ -112,7 +112,9 @@ class _Stream:
         self._fitting = ComputeWorker("fitting", self._fit, self._on_tracked)
         self._meshing = ComputeWorker("candidates", self._candidates.process, self._on_candidates)
         self._synchronizer = self._make_synchronizer()
-        self._capture = CaptureThread(source, self._synchronizer, self._fitting.submit, clock)
+        hurried = settings.capture.source != "recording" or settings.capture.realtime
+        deliver = self._fitting.submit if hurried else self._fitting.submit_in_turn
+        self._capture = CaptureThread(source, self._synchronizer, deliver, clock)
         self._last_status = ""
         self._next_save_ns: int | None = None
         self._next_candidate_ns = 0
@@ -132,6 +134,7 @@ class _Stream:
             self._tracker,
             source.frame_rate_hz,
             self._timer,
+            self._clock,
         )
 
     def _make_synchronizer(self) -> Synchronizer:

@@ -16,6 +16,7 @@ from common.body.rigged_mesh import build_rigged_mesh
 from common.body.skeleton import Skeleton
 from common.body.skeleton_pose import SkeletonPose, forward_kinematics
 from common.body.view import View
+from common.runtime.clock import Clock
 from common.runtime.stage_timer import StageTimer
 from common.wire.body_message import BodyMessage, encode_body, quantized_skeleton
 from common.wire.candidate_pose import CandidatePose, decode_candidate_pose, encode_candidate_pose
@@ -65,6 +66,7 @@ class SkeletonPath:
         tracker: Tracker,
         frame_rate_hz: float,
         timer: StageTimer,
+        clock: Clock,
     ) -> None:
         self._identity = identity
         self._backgrounds = backgrounds
@@ -72,6 +74,7 @@ class SkeletonPath:
         self._tracker = tracker
         self._frame_rate_hz = frame_rate_hz
         self._timer = timer
+        self._clock = clock
         self._sequence = 0
         self._revision = 0
         self._body: Skeleton | None = None
@@ -110,6 +113,7 @@ class SkeletonPath:
                 pose=fit.pose,
                 previous=previous,
                 previous_age_ns=age_ns,
+                send_delay_ns=self._clock.now_ns() - capture_ns,
             )
         )
         self._sequence += 1

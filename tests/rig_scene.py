@@ -57,6 +57,7 @@ def skeleton_path(tracker: GaussNewtonTracker | None = None) -> SkeletonPath:
         tracker or GaussNewtonTracker(GaussNewtonSettings()),
         RATE_HZ,
         StageTimer(ManualClock()),
+        ManualClock(),
     )
 
 

@@ -115,15 +115,15 @@ def test_no_points_at_depth_edges() -> None:
 
 
 def test_front_and_back_of_a_thin_hand_stay_two_points() -> None:
-    front = Camera("front", 320, 240, 260.0, 260.0, 160.0, 120.0, look_at(np.array([0, 0, 2.0]), np.zeros(3)))
-    back = Camera("back", 320, 240, 260.0, 260.0, 160.0, 120.0, look_at(np.array([0, 0, -2.0]), np.zeros(3)))
-    depth_mm = np.full((100, 100), 1994, np.uint16)  # 12 mm thick, voxels of 22 mm
+    front = Camera("front", 320, 240, 260.0, 260.0, 160.0, 120.0, look_at(np.array([0, 0, 2.011]), np.zeros(3)))
+    back = Camera("back", 320, 240, 260.0, 260.0, 160.0, 120.0, look_at(np.array([0, 0, -1.989]), np.zeros(3)))
+    depth_mm = np.full((100, 100), 1994, np.uint16)  # 12 mm thick, inside one layer of voxels
     views = [View(camera, 110, 70, depth_mm, np.zeros((100, 100, 3), np.uint8)) for camera in (front, back)]
     cloud = PointSampler([front, back]).points(views)
     facing = cloud.normals[:, 2]
     assert (np.abs(facing) > 0.99).all()
-    np.testing.assert_allclose(cloud.positions[facing > 0, 2], 0.006, atol=1e-3)
-    np.testing.assert_allclose(cloud.positions[facing < 0, 2], -0.006, atol=1e-3)
+    np.testing.assert_allclose(cloud.positions[facing > 0, 2], 0.017, atol=1e-3)
+    np.testing.assert_allclose(cloud.positions[facing < 0, 2], 0.005, atol=1e-3)
 
 
 def test_bad_arguments_are_refused() -> None:

@@ -54,3 +54,26 @@ def test_closing_wakes_a_waiting_thread_and_refuses_later_values() -> None:
     with pytest.raises(Closed):
         slot.wait(0)
     assert slot.dropped == 0
+
+
+def test_in_turn_nothing_is_dropped() -> None:
+    slot: LatestValue[int] = LatestValue()
+
+    def feed() -> None:
+        for number in range(50):
+            slot.put_in_turn(number)
+
+    feeder = threading.Thread(target=feed, daemon=True)
+    feeder.start()
+    assert [slot.wait(5) for _ in range(50)] == list(range(50))
+    assert slot.dropped == 0
+
+
+def test_closing_frees_whoever_waits_for_a_turn() -> None:
+    slot: LatestValue[int] = LatestValue()
+    slot.put(1)
+    waiting = threading.Thread(target=slot.put_in_turn, args=(2,), daemon=True)
+    waiting.start()
+    slot.close()
+    waiting.join(5)
+    assert not waiting.is_alive()

@@ -121,6 +121,12 @@ def test_the_previous_frame_keeps_to_its_stated_error(turn_rad: float) -> None:
     assert abs(decoded.previous_age_ns - 33_300_000) <= AGE_STEP_NS / 2
 
 
+@pytest.mark.parametrize(("delay_ns", "told_ns"), [(0, 0), (9_300_000, 9_500_000), (10**9, 127_500_000), (-5, 0)])
+def test_the_time_from_capture_to_sending_is_told_to_half_a_millisecond(delay_ns: int, told_ns: int) -> None:
+    decoded = decode_skeleton(encode_skeleton(replace(some_packet(), send_delay_ns=delay_ns)))
+    assert decoded.send_ns - decoded.capture_ns == told_ns
+
+
 def test_a_fast_frame_repeats_within_three_tenths_of_a_degree() -> None:
     packet = some_packet()
     previous = moved(packet.pose, 0.0, 12 / 30)  # every joint at 12 rad/s, 30 frames/s
@@ -130,7 +136,7 @@ def test_a_fast_frame_repeats_within_three_tenths_of_a_degree() -> None:
 
 
 @pytest.mark.parametrize(
-    ("step_m", "age_ns"), [(3.3, 33_000_000), (-3.3, 33_000_000), (0, 6_600_000_000), (0, -1_000_000)]
+    ("step_m", "age_ns"), [(3.3, 33_000_000), (-3.3, 33_000_000), (0, 256_000_000), (0, -1_000_000)]
 )
 def test_a_previous_frame_too_far_away_is_left_out(step_m: float, age_ns: int) -> None:
     packet = some_packet()
@@ -257,13 +263,14 @@ def golden_packet() -> SkeletonPacket:
     confidence = (np.arange(LINK_COUNT) % 16 / 15).astype(np.float32)
     pose = SkeletonPose(np.array([0.5, 0.95, -0.25], np.float32), rotations, confidence)
     previous = replace(pose, root_position=np.array([0.49, 0.95, -0.26], np.float32))
-    return SkeletonPacket(1, 2, 3, 4_000_000_005, 6, 0.8, pose, previous, 33_300_000)
+    return SkeletonPacket(1, 2, 3, 4_000_000_005, 6, 0.8, pose, previous, 33_000_000, 12_500_000)
 
 
 def test_the_golden_packet_decodes_to_known_values() -> None:
     decoded, expected = decode_skeleton(bytes.fromhex(GOLDEN.read_text())), golden_packet()
     assert (decoded.person, decoded.epoch, decoded.sequence, decoded.body_revision) == (1, 2, 3, 6)
-    assert (decoded.capture_ns, decoded.previous_age_ns) == (4_000_000_005, 33_300_000)
+    assert (decoded.capture_ns, decoded.previous_age_ns) == (4_000_000_005, 33_000_000)
+    assert decoded.send_ns == 4_012_500_005
     assert decoded.fit_confidence == pytest.approx(0.8)
     np.testing.assert_allclose(decoded.pose.root_position, [0.5, 0.95, -0.25], atol=1e-7)
     np.testing.assert_allclose(decoded.pose.rotations, expected.pose.rotations, atol=5e-5)

@@ -50,6 +50,10 @@ class ComputeWorker(Generic[Input, Output]):
         """Hand in the next input, from any thread; an input still waiting is dropped and counted."""
         self._inputs.put(value)
 
+    def submit_in_turn(self, value: Input) -> None:
+        """Hand in the next input from a thread that can wait until the one before was taken; nothing is dropped."""
+        self._inputs.put_in_turn(value)
+
     async def wait_ready(self) -> None:
         """Return once the warm-up is done. If that failed, ``run`` raises and this waits until it is cancelled."""
         await self._ready.wait()

@@ -38,7 +38,15 @@ class LatestValue(Generic[Value]):
                 return
             self._dropped += len(self._held)
             self._held = [value]
-            self._changed.notify()
+            self._changed.notify_all()
+
+    def put_in_turn(self, value: Value) -> None:
+        """Wait until nothing is held, then hold ``value``: for a source that can wait, so that nothing is dropped."""
+        with self._changed:
+            self._changed.wait_for(lambda: not self._held or self._closed)
+            if not self._closed:
+                self._held = [value]
+                self._changed.notify_all()
 
     def wait(self, timeout_s: float | None = None) -> Value:
         """Take the value, waiting for one.
@@ -52,6 +60,7 @@ class LatestValue(Generic[Value]):
                 raise TimeoutError(f"no value within {timeout_s} s")
             if self._closed:
                 raise Closed
+            self._changed.notify_all()
             return self._held.pop()
 
     def close(self) -> None:

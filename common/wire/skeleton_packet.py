@@ -2,7 +2,8 @@
 
 Layout, little endian: header (24 bytes) | pose (155) | previous frame (67) | CRC32 of all before (4).
 header: version u8, person u8, epoch u32, sequence u32, capture time i64 [ns], body revision u8, flags u8,
-    fit confidence u8 [1/255], age of the previous frame u16 [0.1 ms], step of its rotations u8 [0.2 mrad].
+    fit confidence u8 [1/255], time from capture to sending u8 [0.5 ms], age of the previous frame u8 [1 ms], step of
+    its rotations u8 [0.2 mrad].
 pose, bits: root position 3 × 20 [0.1 mm], per rotation the index of its largest component 2, then per rotation the
     other three components 3 × 15, confidence 4 each [1/15].
 previous frame, bits: root displacement 3 × 16 [0.1 mm], per rotation the rotation vector from the present rotation
@@ -45,13 +46,14 @@ from common.wire.quantization import (
 
 POSE_BYTES = (3 * POSITION_BITS + LINK_COUNT * (2 + 3 * ROTATION_BITS + 4) + 7) // 8
 _PREVIOUS_BYTES = (3 * 16 + LINK_COUNT * 3 * 7 + 7) // 8
-_HEADER = struct.Struct("<BBIIqBBBHB")
+_HEADER = struct.Struct("<BBIIqBBBBBB")
 _CRC = struct.Struct("<I")
 SKELETON_PACKET_BYTES = _HEADER.size + POSE_BYTES + _PREVIOUS_BYTES + _CRC.size
 
 CONFIDENCE_STEP = 1 / 15
 FIT_CONFIDENCE_STEP = 1 / 255
-AGE_STEP_NS = 100_000
+AGE_STEP_NS = 1_000_000
+SEND_STEP_NS = 500_000
 ROTATION_STEP_UNIT_RAD = 2e-4
 
 _HAS_PREVIOUS = 0x01
@@ -67,6 +69,8 @@ class SkeletonPacket:
     ``epoch``: the sender's run; ``sequence``: frame number in it; ``capture_ns``: the sender's monotonic clock [ns];
     ``body_revision``: the body message whose sizes belong to the pose; ``fit_confidence`` in [0, 1].
     ``previous``: the frame ``previous_age_ns`` [ns] earlier, coarse, with this frame's confidences; None: not sent.
+    ``send_delay_ns``: from capture to sending, at most 127.5 ms are told: the bulk window needs the time on the way
+    without the time it took to fit the frame.
     """
 
     person: int
@@ -78,6 +82,12 @@ class SkeletonPacket:
     pose: SkeletonPose
     previous: SkeletonPose | None = None
     previous_age_ns: int = 0
+    send_delay_ns: int = 0
+
+    @property
+    def send_ns(self) -> int:
+        """When the packet was sent, by the sender's clock [ns]."""
+        return self.capture_ns + self.send_delay_ns
 
 
 def encode_pose(pose: SkeletonPose) -> bytes:
@@ -125,7 +135,7 @@ def quantized_pose(pose: SkeletonPose) -> SkeletonPose:
 def encode_skeleton(packet: SkeletonPacket) -> bytes:
     """``SKELETON_PACKET_BYTES`` of one frame.
 
-    The previous frame is left out where it cannot be expressed: older than 6.5535 s or the root more than 3.2767 m
+    The previous frame is left out where it cannot be expressed: older than 255 ms or the root more than 3.2767 m
     away along an axis.
 
     Raises:
@@ -143,6 +153,7 @@ def encode_skeleton(packet: SkeletonPacket) -> bytes:
         checked_int("body revision", packet.body_revision, 0, U8_MAX),
         _HAS_PREVIOUS if repeat is not None else 0,
         round(checked_float("fit confidence", float(packet.fit_confidence), 0, 1) / FIT_CONFIDENCE_STEP),
+        min(max(round(packet.send_delay_ns / SEND_STEP_NS), 0), U8_MAX),
         age,
         step,
     )
@@ -161,15 +172,16 @@ def decode_skeleton(data: bytes) -> SkeletonPacket:
         raise WireError(f"skeleton packet: {len(data)} bytes, expected {SKELETON_PACKET_BYTES}")
     if zlib.crc32(data[: -_CRC.size]) != _CRC.unpack(data[-_CRC.size :])[0]:
         raise WireError("skeleton packet: checksum does not match")
-    _, person, epoch, sequence, capture_ns, revision, flags, fit, age, step = _HEADER.unpack_from(data)
+    _, person, epoch, sequence, capture_ns, revision, flags, fit, sending, age, step = _HEADER.unpack_from(data)
     checked_int("capture time", capture_ns, 0, TIME_MAX_NS)
     if flags & ~_HAS_PREVIOUS:
         raise WireError(f"skeleton packet: unknown flags 0x{flags:02x}")
     end = _HEADER.size + POSE_BYTES
     pose = decode_pose(data[_HEADER.size : end])
     previous = _decode_previous(data[end : end + _PREVIOUS_BYTES], step, pose) if flags & _HAS_PREVIOUS else None
+    fit_confidence, age_ns, send_delay_ns = fit * FIT_CONFIDENCE_STEP, age * AGE_STEP_NS, sending * SEND_STEP_NS
     return SkeletonPacket(
-        person, epoch, sequence, capture_ns, revision, fit * FIT_CONFIDENCE_STEP, pose, previous, age * AGE_STEP_NS
+        person, epoch, sequence, capture_ns, revision, fit_confidence, pose, previous, age_ns, send_delay_ns
     )
 
 
@@ -177,7 +189,7 @@ def _encode_previous(packet: SkeletonPacket, present: SkeletonPose) -> tuple[int
     """(age, rotation step, bits) of the previous frame relative to the ``present`` pose as decoded, or None."""
     previous = packet.previous
     age = round(packet.previous_age_ns / AGE_STEP_NS)
-    if previous is None or not 0 <= age <= 0xFFFF:
+    if previous is None or not 0 <= age <= U8_MAX:
         return None
     moved_m = previous.root_position.astype(np.float64) - present.root_position
     displacement = np.rint(moved_m / POSITION_STEP_M)
