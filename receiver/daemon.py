@@ -11,6 +11,7 @@ import logging
 import secrets
 from collections import Counter, deque
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 from common.body.skeleton import Skeleton
@@ -173,11 +174,12 @@ class _Show:
         if frame is None:
             self._counts["withheld"] += 1
             return
-        self.viewer.show(frame)
-        self._state.shown(frame, shown.repository_poses)
         latency_ns = self._channels.age_ns(frame.capture_ns, now_ns)
         if latency_ns is not None:
             self._timer.add("capture to shown", latency_ns)
+            frame = replace(frame, age_ms=latency_ns / 1e6)
+        self.viewer.show(frame)
+        self._state.shown(frame, shown.repository_poses)
         sigma = None if frame.pose_id is None else frame.sigma
         self._record("frame", [shown.epoch, frame.sequence, frame.pose_id, sigma, latency_ns])
 

@@ -228,7 +228,7 @@ def skeleton_from_joints(joints: Array, stature_m: float) -> tuple[Skeleton, Ske
     offsets[1:] = np.einsum("lji,lj->li", rotations[parents], origins[1:] - origins[parents])
     tips = average.tips.copy()
     for link in range(1, LINK_COUNT):
-        if LINK_PARENTS[link] > 0 and not LINK_PARENTS[link] == LINK_INDEX["upper_spine"]:
+        if LINK_PARENTS[link] > 0 and LINK_PARENTS[link] != LINK_INDEX["upper_spine"]:
             tips[LINK_PARENTS[link]] = offsets[link]
     tips[LINK_INDEX["pelvis"]] = offsets[LINK_INDEX["lower_spine"]]
     tips[LINK_INDEX["upper_spine"]] = offsets[LINK_INDEX["neck"]]

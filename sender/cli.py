@@ -45,17 +45,19 @@ def parse_arguments(arguments: list[str] | None = None) -> argparse.Namespace:
     return parser.parse_args(arguments)
 
 
+def source_of(given: dict[str, object]) -> dict[str, object]:
+    """Settings given on the command line, with the capture source that they imply."""
+    if "capture.recording" in given:
+        return given | {"capture.source": "recording"}
+    return given | {"capture.source": "rig"} if "capture.rig_socket" in given else given
+
+
 def main() -> None:
     """Entry point of the console script."""
     options = parse_arguments()
     set_up_logging(options.log_level)
-    given = overrides(options)
-    if "capture.recording" in given:
-        given["capture.source"] = "recording"
-    elif "capture.rig_socket" in given:
-        given["capture.source"] = "rig"
     try:
-        settings = load_settings(SenderSettings, options.config, given)
+        settings = load_settings(SenderSettings, options.config, source_of(overrides(options)))
     except SettingsError as error:
         sys.exit(f"telepose-send: {error}")
     from sender.daemon import SenderDaemon  # numba and OpenCV take a second: not for --help or a wrong setting

@@ -121,3 +121,20 @@ trees: st.SearchStrategy[Any] = st.builds(
 @given(trees)
 def test_dumped_settings_read_back_equal(tmp_path_factory: pytest.TempPathFactory, settings: Root) -> None:
     assert load(tmp_path_factory.getbasetemp(), dump_settings(settings)) == settings
+
+
+@dataclass(frozen=True)
+class Port:
+    host: str = "here"
+    number: int = 0
+
+
+@dataclass(frozen=True)
+class WithOwnDefault:
+    port: Port = field(default_factory=lambda: Port(number=8080))
+
+
+def test_a_table_named_in_part_keeps_the_rest_of_its_owners_default(tmp_path: Path) -> None:
+    file = tmp_path / "settings.toml"
+    file.write_text('[port]\nhost = "there"\n')
+    assert load_settings(WithOwnDefault, file) == WithOwnDefault(Port("there", 8080))

@@ -64,7 +64,7 @@ def test_moving_and_turning_the_whole_person_costs_nothing() -> None:
 def test_it_grows_with_the_motion() -> None:
     scores = [distortion_score(captured(0.4), links_of(arms_down_by(a)), WEIGHTS) for a in (0.4, 0.6, 0.9, 1.3)]
     assert scores == sorted(scores)
-    assert scores[-1] > 5 * scores[1] > 0
+    assert scores[-1] > 3 * scores[1] > 0
 
 
 def test_it_is_not_commutative() -> None:
@@ -88,7 +88,7 @@ def test_a_regions_weight_counts() -> None:
     target = links_of(arms_down_by(1.3))
     without = EQUAL.copy()
     without[[LINK_INDEX["left_upper_arm"], LINK_INDEX["right_upper_arm"]]] = 0
-    assert distortion_score(captured(0.4), target, without) < 0.8 * distortion_score(captured(0.4), target, EQUAL)
+    assert distortion_score(captured(0.4), target, without) < 0.9 * distortion_score(captured(0.4), target, EQUAL)
     assert WEIGHTS[LINK_INDEX["left_fingers"]] < WEIGHTS[LINK_INDEX["left_hand"]] < WEIGHTS[LINK_INDEX["head"]]
 
 

@@ -115,7 +115,7 @@ def _grid_faces(depth, index):  # type: ignore[no-untyped-def]
         for c in range(columns - 1):
             a, b = index[r, c], index[r, c + 1]
             d, e = index[r + 1, c], index[r + 1, c + 1]
-            present = (a >= 0) + (b >= 0) + (d >= 0) + (e >= 0)
+            present = int(a >= 0) + int(b >= 0) + int(d >= 0) + int(e >= 0)
             if present < 3:
                 continue
             falling = abs(depth[r, c] - depth[r + 1, c + 1])

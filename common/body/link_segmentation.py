@@ -10,6 +10,7 @@ from common.body.skeleton import Skeleton
 from common.body.skeleton_pose import bone_segments
 
 FLESH_M = 0.02  # cloth and flesh beyond the cylinder: without it a thick link claims its thin neighbours' surface
+CAP_M = 0.05  # a cylinder's reach beyond its ends: with the torso's own radius it would claim neck and jaw
 
 
 def nearest_link(
@@ -17,18 +18,19 @@ def nearest_link(
 ) -> NDArray[np.uint8]:
     """Link (V,) uint8 of each vertex (V, 3) [m, world]: the smallest distance to the bone relative to its thickness.
 
-    ``T_world_link`` (L, 4, 4): the posed links (``forward_kinematics``). Dividing by the radius (and 2 cm of flesh)
-    lets a thick torso reach its own surface before a thin arm beside it does.
+    ``T_world_link`` (L, 4, 4): the posed links (``forward_kinematics``). The distance is (across / thickness)² +
+    (beyond the end / cap)²; thickness is the radius and 2 cm of flesh, so that a thick torso reaches its own surface
+    before a thin arm beside it does; the cap is at most 5 cm.
     """
     starts, ends = bone_segments(skeleton, T_world_link)
-    axes = ends - starts
-    lengths_squared = np.maximum(np.einsum("lk,lk->l", axes, axes), np.float32(1e-12))
+    lengths = np.maximum(np.linalg.norm(ends - starts, axis=1), np.float32(1e-6))
     thickness = skeleton.radii + np.float32(FLESH_M)
-    return _nearest(vertices, starts, axes, 1 / lengths_squared, 1 / (thickness * thickness))
+    caps = np.minimum(thickness, np.float32(CAP_M))
+    return _nearest(vertices, starts, (ends - starts) / lengths[:, None], lengths, thickness**-2, caps**-2)
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
-def _nearest(vertices, starts, axes, inverse_lengths_squared, inverse_thickness_squared):  # type: ignore[no-untyped-def]
+def _nearest(vertices, starts, axes, lengths, per_thickness_squared, per_cap_squared):  # type: ignore[no-untyped-def]
     links = np.empty(len(vertices), np.uint8)
     for v in range(len(vertices)):
         best = np.float32(np.inf)
@@ -36,11 +38,10 @@ def _nearest(vertices, starts, axes, inverse_lengths_squared, inverse_thickness_
             x = vertices[v, 0] - starts[link, 0]
             y = vertices[v, 1] - starts[link, 1]
             z = vertices[v, 2] - starts[link, 2]
-            ax, ay, az = axes[link, 0], axes[link, 1], axes[link, 2]
-            along = (x * ax + y * ay + z * az) * inverse_lengths_squared[link]
-            along = min(max(along, np.float32(0.0)), np.float32(1.0))
-            x, y, z = x - along * ax, y - along * ay, z - along * az
-            distance = (x * x + y * y + z * z) * inverse_thickness_squared[link]
+            along = x * axes[link, 0] + y * axes[link, 1] + z * axes[link, 2]
+            across_squared = x * x + y * y + z * z - along * along
+            beyond = max(-along, along - lengths[link], np.float32(0.0))
+            distance = across_squared * per_thickness_squared[link] + beyond * beyond * per_cap_squared[link]
             if distance < best:
                 best = distance
                 links[v] = link

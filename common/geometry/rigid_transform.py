@@ -30,7 +30,7 @@ def transform_points(T_target_source: Array, points: Array) -> Array:
     return np.ascontiguousarray(points @ T[:3, :3].T + T[:3, 3])
 
 
-def look_at(eye: Array, target: Array, up: Array | None = None) -> Array:
+def look_at(eye: Array, target: Array, up: Array | None = None) -> NDArray[np.float64]:
     """``T_world_camera`` (4, 4) of an OpenCV camera at ``eye`` (3,) looking at ``target`` (3,) [m, world].
 
     Raises:
@@ -42,4 +42,5 @@ def look_at(eye: Array, target: Array, up: Array | None = None) -> Array:
         raise ValueError("look_at: eye, target and up do not span a view")
     forward /= np.linalg.norm(forward)
     right /= np.linalg.norm(right)
-    return rigid_transform(np.stack([right, np.cross(forward, right), forward], axis=1), np.asarray(eye, float))
+    R_world_camera = np.stack([right, np.cross(forward, right), forward], axis=1)
+    return np.asarray(rigid_transform(R_world_camera, np.asarray(eye, float)), np.float64)

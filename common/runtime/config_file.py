@@ -71,7 +71,8 @@ def _name(path: tuple[str, ...]) -> str:
     return f"[{'.'.join(tables)}] {key}" if tables else key
 
 
-def _from_table(cls: type[Any], table: Mapping[str, object], path: tuple[str, ...]) -> Any:
+def _from_table(cls: type[Any], table: Mapping[str, object], path: tuple[str, ...], default: Any = None) -> Any:
+    """A settings class from its table; what the table leaves out is as in ``default``, or the class's own default."""
     hints = typing.get_type_hints(cls)
     known = [field.name for field in dataclasses.fields(cls) if field.init]
     for key in table:
@@ -79,20 +80,30 @@ def _from_table(cls: type[Any], table: Mapping[str, object], path: tuple[str, ..
             near = difflib.get_close_matches(key, known, 1, 0.5)
             hint = f"did you mean {near[0]!r}?" if near else f"known here: {', '.join(known)}"
             raise SettingsError(f"{_name((*path, key))}: unknown key; {hint}")
-    values = {key: _value(hints[key], value, (*path, key)) for key, value in table.items()}
+    defaults = _defaults(cls, default)
+    values = {key: _value(hints[key], value, (*path, key), defaults.get(key)) for key, value in table.items()}
     try:
-        return cls(**values)
+        return cls(**defaults | values)
     except (ValueError, TypeError) as error:
         table_name = f"[{'.'.join(path)}] " if path else ""
         raise SettingsError(f"{table_name}{error}") from error
 
 
-def _value(kind: Any, value: object, path: tuple[str, ...]) -> Any:
+def _defaults(cls: type[Any], default: Any) -> dict[str, Any]:
+    """What each key is when the file does not name it: a table named in part keeps the rest of its owner's default."""
+    fields = [field for field in dataclasses.fields(cls) if field.init]
+    if default is not None:
+        return {field.name: getattr(default, field.name) for field in fields}
+    made = {f.name: f.default_factory() for f in fields if f.default_factory is not dataclasses.MISSING}
+    return made | {f.name: f.default for f in fields if f.default is not dataclasses.MISSING}
+
+
+def _value(kind: Any, value: object, path: tuple[str, ...], default: Any = None) -> Any:
     """``value``, as it comes from TOML, turned into the annotated type ``kind``."""
     origin, arguments = typing.get_origin(kind), typing.get_args(kind)
     if origin in (types.UnionType, typing.Union):
         (kind,) = (argument for argument in arguments if argument is not type(None))
-        return None if value is None else _value(kind, value, path)
+        return None if value is None else _value(kind, value, path, default)
     if origin is Literal:
         if value not in arguments:
             raise SettingsError(f"{_name(path)}: expected one of {', '.join(map(repr, arguments))}, not {value!r}")
@@ -103,7 +114,7 @@ def _value(kind: Any, value: object, path: tuple[str, ...]) -> Any:
         table = _checked(value, Mapping, "a table", path)
         return {key: _value(arguments[1], item, (*path, key)) for key, item in table.items()}
     if dataclasses.is_dataclass(kind):
-        return _from_table(typing.cast(type[Any], kind), _checked(value, Mapping, "a table", path), path)
+        return _from_table(typing.cast(type[Any], kind), _checked(value, Mapping, "a table", path), path, default)
     return _scalar(kind, value, path)
 
 

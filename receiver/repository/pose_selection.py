@@ -67,7 +67,7 @@ class PoseSelector:
         if on_screen is not None and self._settings.hold:  # first in line: it is kept if it is good enough
             poses = [on_screen, *(pose for pose in poses if pose is not on_screen)]
         mesh, sigma, scored, early = self._search(poses, T_world_link, limit, on_screen)
-        held = mesh is on_screen and early
+        held = self._settings.hold and early and mesh is on_screen
         withheld = self._withhold(sigma, limit)
         self.threshold.follow(sigma)
         self._on_screen = mesh.pose_id

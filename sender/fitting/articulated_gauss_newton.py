@@ -54,6 +54,7 @@ class FitArrays(NamedTuple):
 
 
 INLIER_M = 0.035
+JUDGED_M = 0.10  # points further from the surface than this count as not explained at all
 DATA_SIGMA_M = 0.05  # of one of 2,500 points; neighbours share their errors, so one counts for less than its noise says
 
 
@@ -283,7 +284,7 @@ def judge_pose(
     R, t = forward(state.root, state.local, offsets, table.parents)
     count = len(points)
     near = np.empty((count, NEAR_LINKS), np.int8)
-    near_links(points, R, t, surface, 0.15, near)
+    near_links(points, R, t, surface, JUDGED_M, near)
     link, row, d2 = np.empty(count, np.int64), np.empty(count, np.int64), np.empty(count)
     match_points(points, normals, near, R, t, surface, link, row, d2)
     assigned, explained = np.zeros(len(R)), np.zeros(len(R))

@@ -82,7 +82,7 @@ def _fill_nearest(points: Array, normals: Array, origin: Array, cell: np.float32
 
 @njit(nogil=True, cache=True, error_model="numpy")
 def _take_from_neighbours(
-    points: Array, origin: Array, cell: float, best: Array, distance: Array, x: int, y: int, z: int, step: int
+    points: Array, origin: Array, cell: np.float32, best: Array, distance: Array, x: int, y: int, z: int, step: int
 ) -> None:
     nx, ny, nz = best.shape
     if 0 <= x + step < nx and best[x + step, y, z] >= 0:
@@ -95,7 +95,7 @@ def _take_from_neighbours(
 
 @njit(nogil=True, cache=True, error_model="numpy")
 def _offer(
-    points: Array, origin: Array, cell: float, best: Array, distance: Array, k: int, x: int, y: int, z: int
+    points: Array, origin: Array, cell: np.float32, best: Array, distance: Array, k: int, x: int, y: int, z: int
 ) -> None:
     dx = origin[0] + (x + 0.5) * cell - points[k, 0]
     dy = origin[1] + (y + 0.5) * cell - points[k, 1]

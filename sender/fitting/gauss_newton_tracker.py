@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from common.body.skeleton import LINK_COUNT, LINK_INDEX, Skeleton
+from common.body.skeleton import LINK_COUNT, LINK_INDEX, SIDES, Skeleton
 from common.body.skeleton_pose import SkeletonPose, forward_kinematics
 from common.geometry import quaternion
 from common.geometry.point_cloud import PointCloud
@@ -33,14 +33,16 @@ MINIMUM_POINTS = 40
 
 @dataclass(frozen=True, slots=True)
 class GaussNewtonSettings:
-    """``building_s``: how long the surface is gathered after the start pose. ``good_score``, ``lost_score``: mean robust
-    cost per point (0..1) below which a pose is trusted, and above which the person counts as lost; ``lost_s``: for this
-    long before looking again."""
+    """``building_s``: how long the surface is gathered after the start pose. ``good_score``, ``lost_score``: mean
+    robust cost per point (0..1) below which a pose is trusted, and above which the person counts as lost; ``lost_s``:
+    for this long before looking again. ``stranger_s``: how long the known person is looked for before anybody else in
+    a start pose will do."""
 
     building_s: float = 1.0
     good_score: float = 0.16
     lost_score: float = 0.35
     lost_s: float = 1.0
+    stranger_s: float = 2.0
 
 
 HYPOTHESES = (1.0, 0.5, 0.0)  # shares of the last velocity
@@ -50,7 +52,10 @@ FINE = Schedule(2, 0.08, 0.06, 0.1, 1.0, 1.0)
 GUESS_POINTS, COARSE_POINTS = 250, 800
 LEARN_EVERY = 3
 RETRY_FRAMES = 5  # after a limb search in vain
-_FOLLOWS = {"fingers": "hand", "toes": "foot"}
+SEEN_POINTS = 200  # with fewer explained points no pose is certain
+_FOLLOWS = {"neck": "head"} | {
+    f"{s}_{a}": f"{s}_{b}" for s in SIDES for a, b in (("fingers", "hand"), ("toes", "foot"))
+}
 
 
 class GaussNewtonTracker:
@@ -68,6 +73,7 @@ class GaussNewtonTracker:
         self._usual = np.zeros(LINK_COUNT)  # share of the cloud each link usually explains
         self._result: FitResult | None = None
         self._building_until_ns: int | None = None
+        self._looking_since_ns: int | None = None
         self._good_ns = 0
         self._frames = 0
         self._retry_after = np.zeros(LINK_COUNT, np.int64)
@@ -86,13 +92,10 @@ class GaussNewtonTracker:
     def start_from(self, skeleton: Skeleton, pose: SkeletonPose, cloud: PointCloud, capture_ns: int) -> FitResult:
         """Starts with sizes and pose known from elsewhere (a recording's own joints) and the cloud they belong to."""
         self._body = BodyModel(skeleton)
-        self._search = WholeBodySearch(self._body, self._table)
         self._body.add(cloud, forward_kinematics(skeleton, pose))
-        self._state = self._before = _state_of(pose)
-        self._times_ns = (capture_ns, capture_ns)
+        self._begin(_state_of(pose), capture_ns)
         self._building_until_ns = capture_ns + int(self._settings.building_s * 1e9)
-        self._good_ns = capture_ns
-        fit = self._fitter().judge(cloud, self._state)
+        fit = self._fitter().judge(cloud, _state_of(pose))
         return self._accept(fit, cloud, capture_ns)
 
     def track(self, cloud: PointCloud, capture_ns: int) -> FitResult | None:
@@ -113,50 +116,62 @@ class GaussNewtonTracker:
         return self._accept(fit, cloud, capture_ns)
 
     def _look(self, cloud: PointCloud, capture_ns: int) -> FitResult | None:
-        if self._body is None:
-            found = find_initial_pose(cloud)
-            if isinstance(found, NoPose):
-                self._status = f"looking for a person: {found.reason}"
-                return None
-            return self.start_from(found.skeleton, found.pose, cloud, capture_ns)
-        assert self._search is not None
-        fit = self._search.step(cloud)
-        if fit.score > self._settings.good_score:
+        """The known person in any pose; when there is none, or they do not come, anybody in a start pose."""
+        if self._looking_since_ns is None:
+            self._looking_since_ns = capture_ns
+        if self._search is not None:
+            fit = self._search.step(cloud)
+            if fit.score < self._settings.good_score:
+                self._begin(fit.pose, capture_ns)
+                return self._accept(fit, cloud, capture_ns)
             self._status = f"looking for the known person: best score {fit.score:.2f}"
+            if capture_ns - self._looking_since_ns < self._settings.stranger_s * 1e9:
+                return self._unseen()
+        found = find_initial_pose(cloud)
+        if isinstance(found, NoPose):
+            self._status = f"looking for a person: {found.reason}"
             return self._unseen()
-        self._state = self._before = fit.pose
+        return self.start_from(found.skeleton, found.pose, cloud, capture_ns)
+
+    def _begin(self, state: PoseState, capture_ns: int) -> None:
+        body = self._known_body()
+        self._search = WholeBodySearch(body, self._table)
+        self._state = self._before = state
         self._times_ns = (capture_ns, capture_ns)
+        self._usual = np.zeros(LINK_COUNT)
         self._good_ns = capture_ns
-        self._search = WholeBodySearch(self._body, self._table)
-        return self._accept(self._fitter().judge(cloud, fit.pose), cloud, capture_ns)
+        self._looking_since_ns = None
 
     def _follow(self, cloud: PointCloud, capture_ns: int) -> FitArrays:
         """Velocity hypotheses on a tenth of the points, coarse then fine fit of the best, limbs that got lost."""
         fitter = self._fitter()
+        frames_passed = float(np.clip((capture_ns - self._times_ns[0]) / FRAME_NS, 1.0, 4.0))
+        guess, coarse, fine = (plan._replace(step_scale=frames_passed) for plan in (GUESS, COARSE, FINE))
         some = thinned(cloud, GUESS_POINTS)
-        guesses = [self._predicted(share, capture_ns) for share in HYPOTHESES]
-        fits = [fitter.fit(some, guess, guess, GUESS) for guess in guesses]
+        guesses = self._predicted(capture_ns)
+        fits = [fitter.fit(some, start, start, guess) for start in guesses]
         best = min(range(len(fits)), key=lambda k: fits[k].score)
         predicted = guesses[best]
-        fit = fitter.fit(thinned(cloud, COARSE_POINTS), fits[best].pose, predicted, COARSE)
-        fit = fitter.fit(cloud, fit.pose, predicted, FINE)
+        fit = fitter.fit(thinned(cloud, COARSE_POINTS), fits[best].pose, predicted, coarse)
+        fit = fitter.fit(cloud, fit.pose, predicted, fine)
         for limb in self._limbs:
             fit = self._found_limb(limb, fit, cloud)
         return fit
 
-    def _predicted(self, share: float, capture_ns: int) -> PoseState:
-        """The state moved on at ``share`` of its velocity, scaled to the time passed; twists stay: a straight limb does
-        not show its twist, so its velocity is noise."""
-        assert self._state is not None and self._before is not None
+    def _predicted(self, capture_ns: int) -> list[PoseState]:
+        """The state moved on at each share of its velocity, scaled to the time passed; twists stay: a straight limb
+        does not show its twist, so its velocity is noise."""
+        assert self._state is not None
         now, before = self._state, self._before
         past_ns = self._times_ns[0] - self._times_ns[1]
-        if share == 0.0 or past_ns <= 0:
-            return now
-        ahead = share * min((capture_ns - self._times_ns[0]) / past_ns, 3.0)
+        if before is None or past_ns <= 0:
+            return [now]
+        ahead = np.clip((capture_ns - self._times_ns[0]) / past_ns, 0.0, 3.0) * np.array(HYPOTHESES)
         turn = quaternion.to_rotation_vector(quaternion.from_matrix(np.swapaxes(before.local, 1, 2) @ now.local))
         turn[np.arange(1, LINK_COUNT), self._table.twist_axis[1:]] = 0.0
-        step = quaternion.to_matrix(quaternion.from_rotation_vector(ahead * turn))
-        return PoseState(now.root + ahead * (now.root - before.root), now.local @ step)
+        turns = now.local @ quaternion.to_matrix(quaternion.from_rotation_vector(ahead[:, None, None] * turn))
+        roots = now.root + ahead[:, None] * (now.root - before.root)
+        return [PoseState(root, local) for root, local in zip(roots, turns, strict=True)]
 
     def _fitter(self) -> BodyFitter:
         return BodyFitter(self._known_body(), self._table)
@@ -196,15 +211,16 @@ class GaussNewtonTracker:
         confidence = self._link_confidence(fit, len(cloud))
         pose = SkeletonPose(fit.pose.root, quaternion.from_matrix(local), confidence)
         self._learn(fit, pose, cloud, capture_ns)
-        sure = float(np.clip((self._settings.lost_score - fit.score) / self._settings.lost_score * 1.25, 0.0, 1.0))
+        lost = self._settings.lost_score
+        sure = np.clip((lost - fit.score) / lost * 1.25, 0.0, 1.0) * min(fit.explained.sum() / SEEN_POINTS, 1.0)
         self._result = FitResult(
             skeleton=body.skeleton,
             pose=pose,
-            converged=fit.score < self._settings.lost_score,
+            converged=fit.score < lost,
             iterations=COARSE.iterations + FINE.iterations,
             inliers=fit.inliers,
             rms_m=fit.rms_m,
-            confidence=sure,
+            confidence=float(sure),
         )
         return self._result
 
@@ -223,9 +239,8 @@ class GaussNewtonTracker:
         seen = fit.explained / np.maximum(fit.assigned, 1.0)
         enough = np.clip(fit.explained / np.maximum(0.3 * self._usual * count, 6.0), 0.0, 1.0)
         confidence = np.clip(seen * enough, 0.0, 1.0)
-        for side in ("left", "right"):
-            for link, mover in _FOLLOWS.items():
-                confidence[LINK_INDEX[f"{side}_{link}"]] = confidence[LINK_INDEX[f"{side}_{mover}"]]
+        for link, leader in _FOLLOWS.items():  # too few points of their own to judge by
+            confidence[LINK_INDEX[link]] = confidence[LINK_INDEX[leader]]
         return confidence.astype(np.float32)
 
     def _unseen(self) -> FitResult | None:

@@ -22,7 +22,7 @@ LIMIT_SIGMA = 0.06  # rad beyond a joint limit
 ROOT_STEP_M = 0.10  # standard deviation of the change of the root's position in 1/30 s
 X, Y = 0, 1  # twist axes: arms lie along x at rest, everything else roughly along y
 
-# link: (twist axis, lowest angles [deg], highest angles [deg], spread about rest [deg], change from frame to frame [deg])
+# link: twist axis; then lowest and highest angles, spread about rest, and change from frame to frame, all in degrees.
 # A spread of 0 locks the axis: fingers and toes are too small for a depth camera at 2.5 m to show how they turn.
 _TABLE: dict[str, tuple[int, tuple[float, ...], tuple[float, ...], tuple[float, ...], tuple[float, ...]]] = {
     "pelvis": (Y, (-400, -400, -400), (400, 400, 400), (400, 400, 400), (20, 20, 20)),
@@ -46,8 +46,8 @@ class JointTable(NamedTuple):
     """The table as arrays for the kernels (L links).
 
     ``parents`` (L,) int64; ``ancestor`` (L, L) bool, [a, l] = a is l or above it; ``twist_axis`` (L,) int64;
-    ``low, high, spread, step`` (L, 3) float64 [rad]: range, standard deviation about rest, and standard deviation of the
-    change in 1/30 s; ``dof_link, dof_axis`` (D,) int64: the D free joint axes, without the six of the root.
+    ``low, high, spread, step`` (L, 3) float64 [rad]: range, standard deviation about rest, and that of the change in
+    1/30 s; ``dof_link, dof_axis`` (D,) int64: the D free joint axes, without the six of the root.
     """
 
     parents: Array

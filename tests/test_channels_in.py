@@ -1,0 +1,181 @@
+"""The receiver's channels against a real sender's, and against bytes from nobody we know."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
+
+import pytest
+
+from common.body.skeleton import human_skeleton
+from common.body.skeleton_pose import rest_pose
+from common.runtime.clock import MonotonicClock
+from common.transport import channels
+from common.transport.channel_subscriber import Arrival
+from common.transport.channels import channel_key
+from common.transport.chunks import OutgoingMessage
+from common.transport.zenoh_session import LinkSettings, ZenohSession, open_session
+from common.wire.body_message import BodyMessage, encode_body
+from common.wire.receiver_report import decode_report
+from common.wire.skeleton_packet import SkeletonPacket, encode_skeleton
+from receiver.channels_in import Handlers, ReceiverChannels
+from sender.channels_out import SenderChannels
+from tests.daemon_processes import free_port
+
+EPOCH = 9
+CLOCK = MonotonicClock()
+
+
+def packet(sequence: int, epoch: int = EPOCH) -> bytes:
+    return encode_skeleton(
+        SkeletonPacket(0, epoch, sequence, CLOCK.now_ns(), 1, 1.0, rest_pose(), send_delay_ns=1_000_000)
+    )
+
+
+def body(epoch: int = EPOCH) -> bytes:
+    return encode_body(BodyMessage(0, epoch, 1, human_skeleton(1.7), 30.0))
+
+
+class Ends:
+    """Both ends of one stream over loopback, and what the receiver's handlers were told."""
+
+    def __init__(self, sending: ZenohSession, receiving: ZenohSession) -> None:
+        self.sending = sending
+        self.heard: dict[str, list[object]] = {"skeleton": [], "pose": [], "body": [], "epoch": [], "presence": []}
+        self.reports: list[Arrival] = []
+        self.sender = SenderChannels(sending, "studio", 0, CLOCK)
+        self.receiver = ReceiverChannels(receiving, "studio", 0, "wall", 1, 2, CLOCK)
+        self.sender.open(self.reports.append, lambda: b"fine")
+        heard = self.heard
+        self.receiver.open(
+            Handlers(
+                skeleton=lambda packet, body, data: heard["skeleton"].append(packet.sequence),
+                pose=heard["pose"].append,
+                body=heard["body"].append,
+                epoch=lambda: heard["epoch"].append(1),
+                presence=heard["presence"].append,
+            )
+        )
+
+    def raw(self, channel: channels.Channel, payload: bytes, receiver: str | None = None) -> None:
+        """Put bytes as anyone on the network could."""
+        self.sending.zenoh.put(channel_key(channel, "studio", 0, receiver), payload)
+
+
+@asynccontextmanager
+async def ends() -> AsyncIterator[Ends]:
+    link = (f"tcp/127.0.0.1:{free_port()}",)
+    async with (
+        open_session(LinkSettings(listen=link)) as sending,
+        open_session(LinkSettings(connect=link)) as receiving,
+    ):
+        made = Ends(sending, receiving)
+        await until(lambda: made.heard["presence"] == [True])
+        await until(lambda: made.sender._skeleton.heard)
+        yield made
+
+
+async def until(condition: Callable[[], object], limit_s: float = 10.0) -> None:
+    async with asyncio.timeout(limit_s):
+        while not condition():  # noqa: ASYNC110 (what is waited for is not an event of ours)
+            await asyncio.sleep(0.01)
+
+
+async def test_a_skeleton_is_handed_on_once_its_body_is_known():
+    async with ends() as both:
+        both.sender.publish_skeleton(packet(0))
+        await until(lambda: both.receiver.counts["body unknown"] == 1)
+        assert both.receiver.lacks_body
+        both.sender.publish_body(body())
+        await until(lambda: both.heard["body"])
+        both.sender.publish_skeleton(packet(1))
+        await until(lambda: both.heard["skeleton"] == [1])
+        assert not both.receiver.lacks_body
+
+
+async def test_a_late_receiver_asks_for_the_body():
+    async with ends() as both:
+        both.sender._body_message = body()  # published before anyone listened
+        both.sender.publish_skeleton(packet(0))
+        await until(lambda: both.receiver.lacks_body)
+        await both.receiver.ask_body()
+        assert not both.receiver.lacks_body
+
+
+async def test_a_new_run_is_told_and_forgets_the_old_clock():
+    async with ends() as both:
+        both.sender.publish_body(body())
+        both.sender.publish_skeleton(packet(0))
+        await until(lambda: both.heard["skeleton"])
+        await both.receiver.ask_time()
+        assert both.receiver.clock_offset.known
+        both.sender.publish_skeleton(packet(0, epoch=EPOCH + 1))
+        await until(lambda: both.heard["epoch"])
+        assert not both.receiver.clock_offset.known
+
+
+async def test_clocks_of_one_host_agree_to_milliseconds():
+    async with ends() as both:
+        for _ in range(10):
+            await both.receiver.ask_time()
+        age_ns = both.receiver.age_ns(CLOCK.now_ns() - 50_000_000, CLOCK.now_ns())
+        assert age_ns is not None
+        assert abs(age_ns - 50_000_000) < 20_000_000
+
+
+async def test_chunks_become_a_message_and_the_report_says_so():
+    async with ends() as both:
+        publisher = both.sender.bulk_publisher("wall")
+        await until(lambda: publisher.heard)
+        message = OutgoingMessage(0, b"m" * 50_000)
+        sequence = 0
+        while not message.all_sent:
+            publisher.put(message.chunk(message.take(16_000), EPOCH, sequence, 0, CLOCK.now_ns()))
+            sequence += 1
+        await until(lambda: both.heard["pose"] == [b"m" * 50_000])
+        both.receiver.send_report(repository_poses=4)
+        await until(lambda: both.reports)
+        report = decode_report(both.reports[-1].payload)
+        assert (report.next_chunk, report.missing_chunks, report.repository_poses) == (sequence, (), 4)
+        assert report.sender_epoch == EPOCH
+        assert report.bulk_bytes > 50_000
+
+
+@pytest.mark.parametrize("payload", [b"\x00", b"\xff" * 250, packet(5)[:-1], packet(5)[:-4] + b"\0\0\0\0"])
+async def test_bytes_that_are_no_skeleton_are_counted_and_change_nothing(payload):
+    async with ends() as both:
+        both.raw(channels.SKELETON, payload)
+        await until(lambda: both.receiver.subscribers["skeleton"].counts["malformed"] == 1)
+        assert both.receiver.skeletons.newest is None
+
+
+async def test_junk_on_every_channel_is_counted():
+    async with ends() as both:
+        both.raw(channels.SKELETON, b"x" * 100_000)
+        both.raw(channels.BODY, b"\xc1" * 50)
+        both.raw(channels.BULK, b"junk" * 20, receiver="wall")
+        subscribers = both.receiver.subscribers
+        await until(lambda: subscribers["skeleton"].counts["size"] == 1)
+        await until(lambda: subscribers["body"].counts["malformed"] == 1)
+        await until(lambda: subscribers["bulk"].counts["malformed"] == 1)
+
+
+async def test_another_persons_packets_under_our_key_are_refused():
+    async with ends() as both:
+        foreign = SkeletonPacket(3, EPOCH, 0, CLOCK.now_ns(), 1, 1.0, rest_pose())
+        both.raw(channels.SKELETON, encode_skeleton(foreign))
+        await until(lambda: both.receiver.subscribers["skeleton"].counts["malformed"] == 1)
+        assert "person 3" in both.receiver.subscribers["skeleton"].last_error
+
+
+async def test_a_vanished_sender_is_noticed(tmp_path):
+    link = (f"tcp/127.0.0.1:{free_port()}",)
+    presence: list[bool] = []
+    nothing = Handlers(lambda *_: None, lambda _: None, lambda _: None, lambda: None, presence.append)
+    async with open_session(LinkSettings(connect=link)) as receiving:
+        ReceiverChannels(receiving, "studio", 0, "wall", 1, 2, CLOCK).open(nothing)
+        async with open_session(LinkSettings(listen=link)) as sending:
+            SenderChannels(sending, "studio", 0, CLOCK).open(lambda _: None, lambda: b"")
+            await until(lambda: presence == [True])
+        await until(lambda: presence == [True, False])
