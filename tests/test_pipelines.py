@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from common.body.skeleton import Skeleton
-from common.body.skeleton_pose import named_joint_positions
+from common.body.skeleton_pose import named_joint_positions, rest_pose
 from common.runtime.clock import ManualClock
 from common.runtime.stage_timer import StageTimer
 from common.wire.body_message import decode_body
@@ -147,6 +147,18 @@ def test_a_new_run_of_the_sender_starts_with_an_empty_repository():
     assert shown.counts["pose of another run"] == 1
     assert shown.frame is not None
     assert shown.frame.pose_id is None
+
+
+def test_a_skeleton_that_would_tear_the_mesh_is_withheld_and_the_last_good_frame_stays():
+    frame = with_packet()[-1]
+    path = animation_path()
+    good = packet_of(frame)
+    path.show(SkeletonToShow(good, last_body(), deque([received_pose(frame)])))
+    for _ in range(20):  # the session learns what σ is usual
+        assert path.show(SkeletonToShow(good, last_body(), deque())).frame is not None
+    torn = dataclasses.replace(good, pose=rest_pose(good.pose.root_position))
+    assert path.show(SkeletonToShow(torn, last_body(), deque())).frame is None
+    assert path.show(SkeletonToShow(good, last_body(), deque())).frame is not None
 
 
 def test_another_persons_pose_is_refused():

@@ -1,5 +1,4 @@
-"""DISPOSE §5.3–5.4, §8: which pose is shown, how long it is held, and what is withheld; and what the animator makes
-of it."""
+"""DISPOSE §5.3–5.4, §8: which pose is shown, how long it is held, and what is withheld."""
 
 from __future__ import annotations
 
@@ -7,7 +6,6 @@ import numpy as np
 import pytest
 
 from common.body.distortion_score import default_region_weights, distortion_score
-from receiver.animation.animator import Animator
 from receiver.repository.pose_selection import PoseSelector, Selection, SelectionSettings
 from tests.capsule_views import arms_down_by, captured, links_of
 
@@ -102,22 +100,3 @@ def test_a_very_high_score_is_withheld_but_not_for_ever() -> None:
 def test_an_unknown_search_is_refused() -> None:
     with pytest.raises(ValueError, match="fastest"):
         SelectionSettings(search="fastest")  # type: ignore[arg-type]
-
-
-def test_a_withheld_frame_repeats_the_last_good_one() -> None:
-    animator = Animator()
-    first = animator.animate(POSES[0], links_of(arms_down_by(0.3)))
-    repeated = animator.animate(POSES[1], links_of(arms_down_by(1.4)), withheld=True)
-    assert repeated.mesh is POSES[0]
-    assert repeated.repeated
-    np.testing.assert_array_equal(repeated.vertices(), first.vertices())
-    after = animator.animate(POSES[1], links_of(arms_down_by(0.85)))
-    assert not after.repeated
-    np.testing.assert_allclose(after.vertices(), POSES[1].mesh.vertices, atol=1e-5)
-
-
-def test_with_nothing_good_yet_a_withheld_frame_is_shown() -> None:
-    animator = Animator()
-    animator.animate(POSES[0], links_of(arms_down_by(0.3)))
-    animator.forget()
-    assert not animator.animate(POSES[1], links_of(arms_down_by(0.8)), withheld=True).repeated

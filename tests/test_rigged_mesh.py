@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from common.body.depth_mesher import mesh_view
-from common.body.rigged_mesh import DRAWN_EDGE_M, build_rigged_mesh
-from common.body.skeleton import LINK_COUNT, LINK_INDEX
+from common.body.rigged_mesh import DRAWN_EDGE_M, DRAWN_LINK_STEPS, build_rigged_mesh
+from common.body.skeleton import LINK_COUNT, LINK_INDEX, LINK_PARENTS
 from common.body.skinning import animate_rigid, link_motion
 from common.body.view import View
 from common.geometry.rigid_transform import transform_points
@@ -84,15 +84,26 @@ def test_bridges_over_occlusions_count_but_are_not_drawn() -> None:
     assert MESH.joint_edges.rest_lengths.max() > DRAWN_EDGE_M
 
 
+def steps_apart(a: int, b: int) -> int:
+    """Links on the way from one to the other in the tree."""
+    chains = [[link] for link in (a, b)]
+    for chain in chains:
+        while chain[-1] > 0:
+            chain.append(LINK_PARENTS[chain[-1]])
+    return len(set(chains[0]) ^ set(chains[1]))
+
+
 def test_links_that_only_touch_are_not_drawn_joined() -> None:
-    links = np.sort(MESH.vertex_link[MESH.faces_drawn], axis=1)
-    joined = {(int(a), int(b)) for a, _, b in links}
-    all_links = np.sort(MESH.vertex_link[MESH.mesh.faces], axis=1)
-    thigh, hand = LINK_INDEX["left_thigh"], LINK_INDEX["left_hand"]
-    pair = (min(thigh, hand), max(thigh, hand))
-    assert pair in {(int(a), int(b)) for a, _, b in all_links}
-    assert pair not in joined
-    assert (min(LINK_INDEX["left_forearm"], hand), max(LINK_INDEX["left_forearm"], hand)) in joined
+    mesh = captured(1.5)  # arms against the body
+    pairs = np.sort(mesh.vertex_link[mesh.mesh.faces[:, [[0, 1], [1, 2], [2, 0]]]].reshape(-1, 2), axis=1)
+    ends = mesh.mesh.vertices[mesh.mesh.faces[:, [[0, 1], [1, 2], [2, 0]]]].reshape(-1, 2, 3)
+    short = np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1) < DRAWN_EDGE_M
+    touching = {pair for pair in map(tuple, pairs[short].tolist()) if steps_apart(*pair) > DRAWN_LINK_STEPS}
+    assert len(touching) > 2  # arm and trunk
+    drawn = np.sort(mesh.vertex_link[mesh.faces_drawn[:, [[0, 1], [1, 2], [2, 0]]]].reshape(-1, 2), axis=1)
+    joined = set(map(tuple, drawn.tolist()))
+    assert not joined & touching
+    assert (LINK_INDEX["left_forearm"], LINK_INDEX["left_hand"]) in joined
 
 
 def test_drawn_triangles_do_not_stretch_far_when_the_arms_part_from_the_body() -> None:

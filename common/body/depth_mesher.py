@@ -75,8 +75,8 @@ def _smooth(depth_mm, radius, range_mm):  # type: ignore[no-untyped-def]
             for j in range(rows + 1):
                 for i in range(-columns if j > 0 else 1, columns + 1):
                     a, b = np.float32(depth_mm[y - j, x - i]), np.float32(depth_mm[y + j, x + i])
-                    near = max(abs(a - centre), abs(b - centre), abs(a + b - 2 * centre)) <= range_mm
-                    if near and a > 0 and b > 0:
+                    # the background, 0, is never near
+                    if max(abs(a - centre), abs(b - centre), abs(a + b - 2 * centre)) <= range_mm:
                         total += a + b
                         count += np.float32(2.0)
             out[y, x] = total / count

@@ -54,6 +54,7 @@ class FitArrays(NamedTuple):
 
 
 INLIER_M = 0.035
+ALONG_SHARE = 0.2  # how much of the squared distance along the surface counts: model points have gaps between them
 JUDGED_M = 0.10  # points further from the surface than this count as not explained at all
 DATA_SIGMA_M = 0.05  # of one of 2,500 points; neighbours share their errors, so one counts for less than its noise says
 
@@ -293,12 +294,23 @@ def judge_pose(
         if link[n] < 0:
             score += 1.0
             continue
-        score += d2[n] / (d2[n] + INLIER_M**2)
-        assigned[link[n]] += 1.0
-        if d2[n] < INLIER_M**2:
-            explained[link[n]] += 1.0
+        c, k = link[n], row[n]
+        off = 0.0
+        for i in range(3):
+            a = 0.0
+            for j in range(3):
+                a += R[c, i, j] * surface.normals[k, j]
+            x = t[c, i]
+            for j in range(3):
+                x += R[c, i, j] * surface.points[k, j]
+            off += a * (points[n, i] - x)
+        distance2 = off * off + ALONG_SHARE * max(d2[n] - off * off, 0.0)
+        score += distance2 / (distance2 + INLIER_M**2)
+        assigned[c] += 1.0
+        if distance2 < INLIER_M**2:
+            explained[c] += 1.0
             inliers += 1
-            square += d2[n]
+            square += distance2
         else:
             link[n] = -1
     share = inliers / count if count else 0.0

@@ -27,6 +27,7 @@ MAX_POINTS_PER_LINK = 4_000
 CELL_M = 0.012  # one model point per cell and facing
 GRID_CELL_M, GRID_MARGIN_M = 0.015, 0.06
 MEMORY_FRAMES = 90.0  # a cell forgets what is older than about this many observations
+RARE = 0.3  # of the median count of a link's cells: fewer observations are noise
 SEAM_WEIGHT = 0.4  # points a neighbouring link also claims bend with the joint and follow neither link well
 SEAM_RATIO = 1.35  # claimed by both when the second bone is at most this much further, in radii
 
@@ -84,9 +85,8 @@ class BodyModel:
         waiting = [link for link in self._stale if self._grids[link] is not None]
         renewed = missing + waiting[: max(refreshed_links - len(missing), 0)]
         for link in renewed:
-            points, normals, _ = self._cells[link].surface()
-            grid = build_link_grid(points, normals, GRID_CELL_M, GRID_MARGIN_M)
-            self._grids[link] = grid, self._cells[link].rigidity()
+            points, normals, rigidity = self._cells[link].surface()
+            self._grids[link] = build_link_grid(points, normals, GRID_CELL_M, GRID_MARGIN_M), rigidity
         self._stale = [link for link in self._stale if link not in renewed]
         if renewed or self._surface is None:
             ready = [entry for entry in self._grids if entry is not None]
@@ -182,14 +182,13 @@ class _LinkCells:
         self.sums = sums[first]
 
     def surface(self) -> tuple[Array, Array, Array]:
-        """Points (M, 3) [m, link frame], unit normals (M, 3), colours (M, 3) uint8."""
-        count = self.sums[:, _COUNT:]
-        normals = self.sums[:, _NORMAL]
-        normals = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-9)
-        return self.sums[:, _POSITION] / count, normals, (self.sums[:, _COLOUR] / count).astype(np.uint8)
-
-    def rigidity(self) -> Array:
-        return self.sums[:, _RIGID] / self.sums[:, _COUNT]
+        """Points (M, 3) [m, link frame], unit normals (M, 3) and rigidities (M,) of the cells that were seen often
+        enough: noise leaves cells that were hit once or twice around the true surface."""
+        often = self.sums[:, _COUNT] >= RARE * np.median(self.sums[:, _COUNT]) if len(self.sums) else slice(0)
+        sums = self.sums[often]
+        count = sums[:, _COUNT:]
+        normals = sums[:, _NORMAL] / np.maximum(np.linalg.norm(sums[:, _NORMAL], axis=1, keepdims=True), 1e-9)
+        return sums[:, _POSITION] / count, normals, sums[:, _RIGID] / count[:, 0]
 
 
 @njit(nogil=True, cache=True)
