@@ -13,7 +13,8 @@ import tempfile
 import time
 from pathlib import Path
 
-SCRIPTS = Path(__file__).resolve().parent
+from daemon_processes import free_port
+
 BIN = Path(sys.executable).parent
 EXIT_DEADLINE_S = 2.5
 START_DEADLINE_S = 60.0
@@ -68,12 +69,6 @@ def parse_arguments() -> argparse.Namespace:
     options.zenoh_port = free_port()
     options.port = options.port if port_is_free(options.port) else free_port()
     return options
-
-
-def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
 
 
 def port_is_free(port: int) -> bool:

@@ -12,19 +12,19 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
+
 from common.body.rigged_mesh import RiggedMesh, build_rigged_mesh
+from common.body.skeleton import NAMED_JOINT_LINKS, Skeleton
+from common.body.skeleton_pose import forward_kinematics
 from common.body.skinning import animate_rigid, link_motion
+from common.geometry.rasterizer import render
 from common.wire.body_message import decode_body
 from common.wire.candidate_pose import decode_candidate_pose
 from common.wire.skeleton_packet import SkeletonPacket, decode_skeleton
 from fidelity import Fidelity, bounding_ball_radius, compare, constant_offsets, joint_errors_m, measuring_cameras
-from numpy.typing import NDArray
-from sender.capture.performer import Performer, open_performer
-
-from common.body.skeleton import NAMED_JOINT_LINKS, Skeleton
-from common.body.skeleton_pose import forward_kinematics
-from common.geometry.rasterizer import render
 from receiver.show_log import read_show_log
+from sender.capture.performer import Performer, open_performer
 
 INSTANTS = 120
 

@@ -21,7 +21,7 @@ from common.wire.receiver_report import decode_report
 from common.wire.skeleton_packet import SkeletonPacket, encode_skeleton
 from receiver.channels_in import Handlers, ReceiverChannels
 from sender.channels_out import SenderChannels
-from tests.daemon_processes import free_port
+from scripts.daemon_processes import free_port
 
 EPOCH = 9
 CLOCK = MonotonicClock()

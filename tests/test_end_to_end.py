@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from receiver.show_log import read_show_log
-from tests.daemon_processes import Site, site
+from scripts.daemon_processes import Site, site
 
 SHOWN, PUBLISHED = "telepose_frames_shown_total", "telepose_skeletons_published_total"
 POSES = "telepose_repository_poses"
