@@ -27,6 +27,7 @@ from common.wire.skeleton_packet import SkeletonPacket
 from receiver.channels_in import Handlers, ReceiverChannels
 from receiver.config import ReceiverSettings
 from receiver.pipeline import AnimationPath, ReceivedPose, Shown, SkeletonToShow, mesh_of
+from receiver.rehearsal import rehearse
 from receiver.show_log import ShowLog
 from receiver.stream_state import StreamState
 from receiver.viewer.headless_screen import HeadlessScreen
@@ -93,7 +94,7 @@ class _Show:
         )
         self._state = StreamState(clock)
         self._animation_path = AnimationPath(settings.repository, self._timer, clock)
-        self._animation = ComputeWorker("animation", self._animation_path.show, self._on_shown)
+        self._animation = ComputeWorker("animation", self._animation_path.show, self._on_shown, rehearse)
         self._messages: asyncio.Queue[bytes] = asyncio.Queue(MESHES_WAITING)
         self._meshes: deque[ReceivedPose] = deque()  # meshed, waiting for the next skeleton; bounded in _mesh_poses
         self._log = ShowLog(settings.shown_log) if settings.shown_log else None

@@ -66,7 +66,7 @@ def demo_report(run: Path, body: str, motion: str | None, data: Path | None) -> 
     received = json.loads((run / "receiver.json").read_text())
     session = read_session(run / "shown.log")
     performer = open_performer(body, motion, data)
-    epoch_ns = int(sent["rig_epoch_ns"])
+    epoch_ns = int(sent["source_epoch_ns"])
     ages = [age_ns / 1e6 for _, age_ns in session.ticks if age_ns is not None]
     report = {
         "performer": performer.name,

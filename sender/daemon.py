@@ -32,6 +32,7 @@ from sender.pipeline import CandidatePath, Candidates, SkeletonPath, StreamIdent
 from sender.receiver_links import ReceiverLinks
 from sender.reconstruction.background import BackgroundModel
 from sender.reconstruction.foreground_points import PointSampler
+from sender.rehearsal import rehearse_candidates, rehearse_fitting
 
 log = logging.getLogger(__name__)
 
@@ -101,7 +102,8 @@ class _Stream:
         self._timer = StageTimer(clock)
         self._statistics = RunStatistics(self._timer)
         identity = StreamIdentity(settings.person, secrets.randbits(32))
-        self._tracker = GaussNewtonTracker(GaussNewtonSettings(), store.load())
+        body = store.load()
+        self._tracker = GaussNewtonTracker(GaussNewtonSettings(), body)
         self._skeletons = self._skeleton_path(identity)
         self._candidates = CandidatePath(identity, settings.poses, self._timer)
         self._scheduler = MeshScheduler()
@@ -109,8 +111,10 @@ class _Stream:
         self._links = ReceiverLinks(
             identity.epoch, self._scheduler, self._channels.bulk_publisher, self._on_sent, clock
         )
-        self._fitting = ComputeWorker("fitting", self._fit, self._on_tracked)
-        self._meshing = ComputeWorker("candidates", self._candidates.process, self._on_candidates)
+        # After a restart somebody waits for the picture: then the first frames load the kernels as they need them.
+        rehearsal = rehearse_fitting if body is None else None
+        self._fitting = ComputeWorker("fitting", self._fit, self._on_tracked, rehearsal)
+        self._meshing = ComputeWorker("candidates", self._candidates.process, self._on_candidates, rehearse_candidates)
         self._synchronizer = self._make_synchronizer()
         hurried = settings.capture.source != "recording" or settings.capture.realtime
         deliver = self._fitting.submit if hurried else self._fitting.submit_in_turn
@@ -246,7 +250,7 @@ class _Stream:
             "candidate_pose_bytes_mean": sum(sizes) / len(sizes) if sizes else 0,
             "receivers": dict(self._links.counts),
             "dropped": self._dropped(),
-            "rig_epoch_ns": rig.epoch_ns if rig else None,
+            "source_epoch_ns": getattr(self._source, "epoch_ns", None),
             "rig_cpu_share": rig.status.get("cpu_s", 0.0) / max(rig_elapsed_s, 1e-3) if rig else None,
             "rig": rig.status if rig else None,
         }

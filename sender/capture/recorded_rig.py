@@ -91,6 +91,11 @@ class RecordedRig:
     def frame_rate_hz(self) -> float:
         return self._recording.frame_rate_hz
 
+    @property
+    def epoch_ns(self) -> int | None:
+        """The recording's time 0 on the clock of the capture times; None before the first ``read``."""
+        return self._start_ns
+
     def read(self, timeout_s: float) -> DepthFrame | None:
         """The next frame, or None when none is due in time.
 

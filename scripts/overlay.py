@@ -1,0 +1,96 @@
+"""Draw the received skeletons over the recording they were found in: ``overlay.py RECORDING OUT.png [FRAMES]``.
+
+Runs both daemons on the recording (once, as fast as frames are fitted) and makes a contact sheet of frames spread over
+it: depth in grey, or colour where there is some; joints that were not seen are left out.
+"""
+
+from __future__ import annotations
+
+import bisect
+import sys
+import tempfile
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from common.body.skeleton import LINK_PARENTS, Skeleton
+from common.body.skeleton_pose import bone_segments, forward_kinematics
+from common.geometry.camera_model import Camera, project
+from common.wire.skeleton_packet import SkeletonPacket
+from daemon_processes import site
+from demo_report import read_session
+from sender.capture.recorded_rig import Recording, open_recording
+
+SEEN = 0.2  # least confidence of a link that is drawn
+LEFT, RIGHT, MIDDLE = (80, 200, 255), (255, 150, 60), (120, 255, 120)
+TILE_HEIGHT, COLUMNS = 360, 4
+
+
+def main() -> None:
+    """The command line."""
+    recording_path, out = Path(sys.argv[1]), Path(sys.argv[2])
+    count = int(sys.argv[3]) if len(sys.argv) > 3 else 8
+    recording = open_recording(recording_path)
+    with tempfile.TemporaryDirectory(prefix="telepose-overlay-") as folder, site(Path(folder)) as here:
+        log = here.folder / "shown.log"
+        receiver = here.receiver("--log-shown", str(log))
+        sender = here.sender("--recording", str(recording_path), "--as-fast-as-possible")
+        assert sender.process.wait(300) == 0, sender.log
+        assert receiver.end()[0] == 0, receiver.log
+        session, epoch_ns = read_session(log), int(here.figures("sender")["source_epoch_ns"])
+        print(here.figures("sender")["dropped"], here.figures("receiver")["dropped"])
+    packets = sorted(session.skeletons.values(), key=lambda packet: packet.capture_ns)
+    times_ns = [packet.capture_ns - epoch_ns for packet in packets]
+    print(f"{len(packets)} skeletons for {len(recording.frames)} frames")
+    shown = [frame for frame in recording.frames if frame[1] == 0]
+    tiles = []
+    for index in np.linspace(0, len(shown) - 1, count).astype(int):
+        time_ns, camera, number = shown[index]
+        at = bisect.bisect_right(times_ns, time_ns + 1_000_000) - 1
+        packet = packets[at] if at >= 0 else None
+        tiles.append(tile(recording, camera, number, packet, session.bodies))
+    blank = np.zeros_like(tiles[0])
+    tiles += [blank] * (-len(tiles) % COLUMNS)
+    rows = [np.concatenate(tiles[i : i + COLUMNS], axis=1) for i in range(0, len(tiles), COLUMNS)]
+    cv2.imwrite(str(out), np.concatenate(rows)[..., ::-1])
+
+
+def tile(
+    recording: Recording, camera: int, number: int, packet: SkeletonPacket | None, bodies: dict[int, Skeleton]
+) -> NDArray[np.uint8]:
+    """One frame with its skeleton."""
+    depth, colour = recording.load(camera, number)
+    near, far = np.percentile(depth[depth > 0], [1, 99]) if (depth > 0).any() else (0, 1)
+    grey = np.clip(230 - 180 * (depth.astype(float) - near) / max(far - near, 1), 30, 255).astype(np.uint8)
+    picture = np.repeat(np.where(depth > 0, grey, 0)[..., None], 3, axis=2).astype(np.uint8)
+    if colour is not None:
+        picture = (colour // 2 + picture // 2).astype(np.uint8)
+    scale = TILE_HEIGHT / picture.shape[0]
+    picture = cv2.resize(picture, None, fx=scale, fy=scale)
+    if packet is not None and packet.body_revision in bodies:
+        draw(picture, recording.cameras[camera], packet, bodies[packet.body_revision], scale)
+        label = f"{number}: fit {packet.fit_confidence:.2f}"
+    else:
+        label = f"{number}: no skeleton"
+    cv2.putText(picture, label, (6, 18), cv2.FONT_HERSHEY_SIMPLEX, 0.5, (255, 255, 255), 1, cv2.LINE_AA)
+    return np.asarray(picture, np.uint8)
+
+
+def draw(picture: NDArray[np.uint8], camera: Camera, packet: SkeletonPacket, body: Skeleton, scale: float) -> None:
+    """Bones of the links that were seen, in the picture's pixels."""
+    starts, ends = bone_segments(body, forward_kinematics(body, packet.pose))
+    first, _ = project(camera, starts)
+    last, _ = project(camera, ends)
+    for link in range(len(LINK_PARENTS)):
+        if packet.pose.confidence[link] < SEEN:
+            continue
+        colour = MIDDLE if link < 5 else LEFT if link < 14 else RIGHT
+        a, b = (tuple(int(v) for v in end[link] * scale) for end in (first, last))
+        cv2.line(picture, a, b, colour, 2, cv2.LINE_AA)
+        cv2.circle(picture, a, 3, colour, -1, cv2.LINE_AA)
+
+
+if __name__ == "__main__":
+    main()

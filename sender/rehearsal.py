@@ -1,0 +1,68 @@
+"""The sender's whole path once over a mannequin, so that every kernel is there before the first real frame."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from common.body.mannequin import mannequin, mannequin_camera, mannequin_depth
+from common.body.skeleton_pose import forward_kinematics
+from common.body.view import View
+from common.geometry.camera_model import Camera
+from common.runtime.clock import MonotonicClock
+from common.runtime.stage_timer import StageTimer
+from sender.capture.frame_set import DepthFrame, FrameSet
+from sender.config import CandidateSettings
+from sender.fitting.body_model import BodyModel
+from sender.fitting.gauss_newton_tracker import GaussNewtonSettings, GaussNewtonTracker
+from sender.fitting.tracker import FitResult
+from sender.pipeline import CandidatePath, SkeletonPath, StreamIdentity, TrackedFrame
+from sender.reconstruction.background import BackgroundModel
+from sender.reconstruction.foreground_points import PointSampler
+
+FRAME_NS = 33_333_333
+_IDENTITY = StreamIdentity(0, 0)
+
+
+def rehearse_fitting() -> None:
+    """Find a mannequin and follow it for a few frames."""
+    camera = mannequin_camera()
+    depth = mannequin_depth(camera)
+    colour = np.full((*depth.shape, 3), 128, np.uint8)
+    room = np.where(depth > 0, 0, 4000).astype(np.uint16)
+    clock = MonotonicClock()
+    tracker = GaussNewtonTracker(GaussNewtonSettings(building_s=2 * FRAME_NS / 1e9))
+    background, sampler = BackgroundModel(camera, room), PointSampler([camera])
+    path = SkeletonPath(_IDENTITY, [background], sampler, tracker, 30.0, StageTimer(clock), clock)
+    for index in range(1, 5):
+        frame = DepthFrame(0, index, index * FRAME_NS, depth, colour)
+        path.process(FrameSet(frame.capture_ns, (frame,)))
+
+
+def rehearse_restart() -> None:
+    """Find a person who is known already, in the middle of a motion."""
+    skeleton, pose = mannequin()
+    camera = mannequin_camera()
+    cloud = PointSampler([camera]).points([_view(camera)])
+    body = BodyModel(skeleton)
+    body.add(cloud, forward_kinematics(skeleton, pose))
+    tracker = GaussNewtonTracker(GaussNewtonSettings(), BodyModel.from_bytes(body.to_bytes()))
+    for index in range(2):
+        tracker.track(cloud, index * FRAME_NS)
+
+
+def rehearse_candidates() -> None:
+    """Make candidate poses of a mannequin."""
+    skeleton, pose = mannequin()
+    fit = FitResult(skeleton, pose, converged=True, iterations=1, inliers=1.0, rms_m=0.0, confidence=1.0)
+    T_world_link = forward_kinematics(skeleton, pose)
+    views = (_view(mannequin_camera()),)
+    tracked = TrackedFrame(0, views, fit, skeleton=skeleton, pose=pose, T_world_link=T_world_link)
+    candidates = CandidatePath(_IDENTITY, CandidateSettings(), StageTimer(MonotonicClock()))
+    for _ in range(2):  # the second meets the first in the usable pose set
+        candidates.remember(tracked)
+        candidates.process(tracked)
+
+
+def _view(camera: Camera) -> View:
+    depth = mannequin_depth(camera)
+    return View(camera, 0, 0, depth, np.full((*depth.shape, 3), 128, np.uint8))
