@@ -204,8 +204,7 @@ def skeleton_from_joints(joints: Array, stature_m: float) -> tuple[Skeleton, Ske
     average = average_skeleton(stature_m)
     rotations = np.tile(np.eye(3), (LINK_COUNT, 1, 1))
     origins = np.full((LINK_COUNT, 3), np.nan)
-    for name, link in NAMED_JOINTS:
-        origins[LINK_INDEX[link]] = at[name]
+    origins[NAMED_JOINT_LINKS] = joints
     origins[LINK_INDEX["lower_spine"]] = (at["pelvis"] + at["chest"]) / 2
     for side, sign in zip(SIDES, (1.0, -1.0), strict=True):
         shoulder, elbow, wrist, hip, knee, ankle = (
@@ -220,22 +219,23 @@ def skeleton_from_joints(joints: Array, stature_m: float) -> tuple[Skeleton, Ske
             down = np.array([0.0, -1.0, 0.0])
             rotations[LINK_INDEX[f"{side}_{part}"]] = quaternion.to_matrix(quaternion.shortest_arc(down, bone))
         origins[LINK_INDEX[f"{side}_clavicle"]] = at["neck"] + (shoulder - at["neck"]) * (0.15, 0.8, 0.5)
-    for link in np.flatnonzero(np.isnan(origins[:, 0])):
-        parent = LINK_PARENTS[link]
-        origins[link] = origins[parent] + rotations[parent] @ average.offsets[link]
+    for row, parent in enumerate(LINK_PARENTS):
+        if not np.isnan(origins[row, 0]):
+            continue
+        origins[row] = origins[parent] + rotations[parent] @ average.offsets[row]
     parents = np.array(LINK_PARENTS[1:])
     offsets = np.zeros((LINK_COUNT, 3))
     offsets[1:] = np.einsum("lji,lj->li", rotations[parents], origins[1:] - origins[parents])
     tips = average.tips.copy()
-    for link in range(1, LINK_COUNT):
-        if LINK_PARENTS[link] > 0 and LINK_PARENTS[link] != LINK_INDEX["upper_spine"]:
-            tips[LINK_PARENTS[link]] = offsets[link]
+    for row, parent in enumerate(LINK_PARENTS):
+        if parent > 0 and parent != LINK_INDEX["upper_spine"]:
+            tips[parent] = offsets[row]
     tips[LINK_INDEX["pelvis"]] = offsets[LINK_INDEX["lower_spine"]]
     tips[LINK_INDEX["upper_spine"]] = offsets[LINK_INDEX["neck"]]
     local = rotations.copy()
     local[1:] = np.swapaxes(rotations[parents], 1, 2) @ rotations[1:]
     pose = SkeletonPose(origins[0], quaternion.from_matrix(local), np.ones(LINK_COUNT, np.float32))
-    return Skeleton(offsets, tips, average.radii), pose
+    return Skeleton(offsets.astype(np.float32), tips, average.radii), pose
 
 
 def _axes(x: Array, near_z: Array) -> Array:

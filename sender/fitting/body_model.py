@@ -94,11 +94,11 @@ class BodyModel:
         return self._surface
 
     def to_bytes(self) -> bytes:
-        """The model as a compressed npz archive, at most ``MAX_BYTES``."""
+        """The model as an npz archive, at most ``MAX_BYTES``; not compressed: noise does not shrink."""
         counts = np.array([len(cells.keys) for cells in self._cells], np.int32)
         sums = np.concatenate([cells.sums for cells in self._cells]).astype(np.float32)
         out = io.BytesIO()
-        np.savez_compressed(
+        np.savez(
             out,
             version=np.int32(FORMAT_VERSION),
             offsets=self.skeleton.offsets,

@@ -39,8 +39,8 @@ class GaussNewtonSettings:
     a start pose will do."""
 
     building_s: float = 1.0
-    good_score: float = 0.16
-    lost_score: float = 0.35
+    good_score: float = 0.095
+    lost_score: float = 0.25
     lost_s: float = 1.0
     stranger_s: float = 2.0
 

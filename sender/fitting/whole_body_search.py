@@ -23,7 +23,7 @@ ROUGH = Schedule(10, 0.40, 0.08, 0.3, 6.0, 0.5)
 POLISH = Schedule(8, 0.15, 0.06, 0.1, 6.0, 0.5)
 KEPT = 3
 ROUGH_POINTS, POLISH_POINTS = 250, 1000
-CERTAIN_SCORE = 0.13  # above it, a limb may still be in the wrong place
+CERTAIN_SCORE = 0.06  # above it, a limb may still be in the wrong place
 POSES_PER_STEP = 2
 # Upper arms raised, elbows bent, thighs raised and knees bent [deg]: hanging, crouching, T-pose, ...
 _POSES_DEG = (
