@@ -14,8 +14,8 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
-from daemon_processes import Running, Site, site
-from run_bench import Row
+from scripts.daemon_processes import Running, Site, site
+from scripts.run_bench import Row
 
 SHOWN, PUBLISHED = "telepose_frames_shown_total", "telepose_skeletons_published_total"
 POSES = "telepose_repository_poses"

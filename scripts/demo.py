@@ -13,7 +13,7 @@ import tempfile
 import time
 from pathlib import Path
 
-from daemon_processes import free_port
+from scripts.daemon_processes import free_port
 
 BIN = Path(sys.executable).parent
 EXIT_DEADLINE_S = 2.5
@@ -38,7 +38,7 @@ def main() -> int:
             print(f"demo: a daemon failed: {codes}", file=sys.stderr)
             return 1
         if options.report and not interrupted:
-            from demo_report import demo_report  # the report's libraries are not needed to run the demo
+            from scripts.demo_report import demo_report  # the report's libraries are not needed to run the demo
 
             report = demo_report(run, options.body, options.motion, options.data)
             options.report.write_text(json.dumps(report, indent=2) + "\n")

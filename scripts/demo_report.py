@@ -22,8 +22,15 @@ from common.geometry.rasterizer import render
 from common.wire.body_message import decode_body
 from common.wire.candidate_pose import decode_candidate_pose
 from common.wire.skeleton_packet import SkeletonPacket, decode_skeleton
-from fidelity import Fidelity, bounding_ball_radius, compare, constant_offsets, joint_errors_m, measuring_cameras
 from receiver.show_log import read_show_log
+from scripts.fidelity import (
+    Fidelity,
+    bounding_ball_radius,
+    compare,
+    constant_offsets,
+    joint_errors_m,
+    measuring_cameras,
+)
 from sender.capture.performer import Performer, open_performer
 
 INSTANTS = 120
@@ -156,7 +163,7 @@ def picture_fidelity(
     true_colours = look.vertex_colours if look.uv is None or look.texture is None else (look.uv, look.texture)
     vertices = animate_rigid(mesh, link_motion(mesh, T_world_link))
     truth = [render(surface, look.faces, true_colours, camera) for camera in cameras]
-    return compare(truth, [render(vertices, mesh.faces_drawn, mesh.mesh.colours, camera) for camera in cameras])
+    return compare(truth, [render(vertices, mesh.faces_drawn, mesh.mesh.surface, camera) for camera in cameras])
 
 
 def percentiles(values: list[float], *wanted: int) -> dict[str, float] | None:

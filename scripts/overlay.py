@@ -19,8 +19,8 @@ from common.body.skeleton import LINK_PARENTS, Skeleton
 from common.body.skeleton_pose import bone_segments, forward_kinematics
 from common.geometry.camera_model import Camera, project
 from common.wire.skeleton_packet import SkeletonPacket
-from daemon_processes import site
-from demo_report import read_session
+from scripts.daemon_processes import site
+from scripts.demo_report import read_session
 from sender.capture.recorded_rig import Recording, open_recording
 
 SEEN = 0.2  # least confidence of a link that is drawn
@@ -68,14 +68,14 @@ def tile(
     if colour is not None:
         picture = (colour // 2 + picture // 2).astype(np.uint8)
     scale = TILE_HEIGHT / picture.shape[0]
-    picture = cv2.resize(picture, None, fx=scale, fy=scale)
+    picture = np.asarray(cv2.resize(picture, None, fx=scale, fy=scale), np.uint8)
     if packet is not None and packet.body_revision in bodies:
         draw(picture, recording.cameras[camera], packet, bodies[packet.body_revision], scale)
         label = f"{number}: fit {packet.fit_confidence:.2f}"
     else:
         label = f"{number}: no skeleton"
     cv2.putText(picture, label, (6, 18), cv2.FONT_HERSHEY_SIMPLEX, 0.5, (255, 255, 255), 1, cv2.LINE_AA)
-    return np.asarray(picture, np.uint8)
+    return picture
 
 
 def draw(picture: NDArray[np.uint8], camera: Camera, packet: SkeletonPacket, body: Skeleton, scale: float) -> None:

@@ -69,7 +69,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if options.seconds is not None and options.seconds <= 0:
         parser.error("--seconds must be positive")
     clips = tuple(clip for clip in options.clips.split(",") if clip)
-    bench = importlib.import_module(PREFIX + options.name)
+    bench = importlib.import_module(f"scripts.{PREFIX}{options.name}")
     rows: list[Row] = bench.run(data=options.data, seconds=options.seconds, clips=clips)
     print(table(rows))
     if options.json is not None:

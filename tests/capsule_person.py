@@ -17,6 +17,8 @@ from receiver.viewer.viewer import ShownFrame
 
 SKELETON: Skeleton = human_skeleton(1.75)
 SHIRT, SKIN, TROUSERS = (60, 120, 220), (230, 170, 130), (90, 75, 65)
+_PALETTE = (SHIRT, SKIN, TROUSERS)
+_PATCH = 16  # pixels of each colour's square in the texture: whole JPEG blocks, which then keep the colour
 _RINGS, _SEGMENTS = 10, 16
 
 
@@ -47,7 +49,8 @@ def capsule_person(pose_id: int = 0, pose: SkeletonPose | None = None) -> Rigged
     mesh = TriangleMesh(
         np.concatenate(vertices).astype(np.float32),
         np.concatenate([f + per_link * link for link, f in enumerate(faces)]).astype(np.int32),
-        np.repeat(np.array([_colour(link) for link in range(LINK_COUNT)], np.uint8), per_link, axis=0),
+        np.repeat([_patch_centre(_colour(link)) for link in range(LINK_COUNT)], per_link, axis=0).astype(np.float32),
+        np.tile(np.repeat(np.array(_PALETTE, np.uint8), _PATCH, axis=0), (_PATCH, 1, 1)),
     )
     vertex_link = np.repeat(np.arange(LINK_COUNT, dtype=np.uint8), per_link)
     T_link_world = inverse(T_world_link.astype(np.float64))
@@ -68,6 +71,10 @@ def _colour(link: int) -> tuple[int, int, int]:
     if link in _SKIN_LINKS:
         return SKIN
     return TROUSERS if link in _TROUSER_LINKS else SHIRT
+
+
+def _patch_centre(colour: tuple[int, int, int]) -> tuple[float, float]:
+    return (_PALETTE.index(colour) + 0.5) / len(_PALETTE), 0.5
 
 
 def _links(*parts: str) -> frozenset[int]:

@@ -21,11 +21,11 @@ FRAME_NS = 33_333_333
 
 
 def ring_camera(index: int, count: int = 4) -> Camera:
-    """One of ``count`` cameras of 200×150 pixels around the person, at 2.5 m; the first sees the front."""
+    """One of ``count`` cameras of 480×360 pixels around the person, at 2.5 m; the first sees the front."""
     around = 2 * math.pi * index / count
     eye = np.array([2.5 * math.sin(around), 1.2, 2.5 * math.cos(around)])
     T_world_camera = look_at(eye, np.array([0.0, 0.9, 0.0])).astype(np.float64)
-    return Camera(f"cam{index + 1}", 200, 150, 150.0, 150.0, 99.5, 74.5, T_world_camera)
+    return Camera(f"cam{index + 1}", 480, 360, 360.0, 360.0, 239.5, 179.5, T_world_camera)
 
 
 def arms_down_by(angle_rad: float, turned_rad: float = 0.0) -> SkeletonPose:
@@ -49,7 +49,7 @@ def capsule_views(pose: SkeletonPose, cameras: int = 4) -> tuple[View, ...]:
     views = []
     for index in range(cameras):
         camera = ring_camera(index, cameras)
-        crop = render_crop(person.vertices, person.faces, person.colours, camera)
+        crop = render_crop(person.vertices, person.faces, person.surface, camera)
         assert crop is not None
         depth_mm = np.rint(crop.depth * 1000).astype(np.uint16)
         views.append(View(camera, crop.u0, crop.v0, depth_mm, crop.colour))

@@ -20,8 +20,8 @@ from common.wire.body_message import BodyMessage, encode_body
 from common.wire.receiver_report import decode_report
 from common.wire.skeleton_packet import SkeletonPacket, encode_skeleton
 from receiver.channels_in import Handlers, ReceiverChannels
-from sender.channels_out import SenderChannels
 from scripts.daemon_processes import free_port
+from sender.channels_out import SenderChannels
 
 EPOCH = 9
 CLOCK = MonotonicClock()

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from common.body.depth_mesher import mesh_view, smooth_depth
+from common.body.depth_mesher import OUTLINE_PIXELS, mesh_view, smooth_depth
 from common.body.view import View
 from common.geometry.camera_model import Camera, project
 from common.geometry.rigid_transform import look_at
@@ -36,6 +36,11 @@ def facing(mesh: TriangleMesh, camera: Camera) -> NDArray[np.bool_]:
     return np.einsum("fk,fk->f", np.cross(b - a, c - a), camera.T_world_camera[:3, 3] - a) > 0
 
 
+def texels(mesh: TriangleMesh) -> NDArray[np.float32]:
+    """Where in the texture the vertices are, in pixels (V, 2)."""
+    return mesh.uv * np.array(mesh.texture.shape[1::-1], np.float32) - np.float32(0.5)
+
+
 @pytest.mark.parametrize("camera", [CAMERA, BENT], ids=lambda c: c.name)
 def test_vertices_project_onto_their_pixels_at_their_depth(camera: Camera) -> None:
     depth = block()
@@ -44,10 +49,27 @@ def test_vertices_project_onto_their_pixels_at_their_depth(camera: Camera) -> No
     mesh = mesh_view(view)
     rows, columns = np.nonzero(depth)
     pixels, depths_m = project(camera, mesh.vertices)
-    np.testing.assert_allclose(pixels, np.stack([columns + view.u0, rows + view.v0], axis=1), atol=2e-3)
+    outline = OUTLINE_PIXELS * np.sign(rows - 6.5) * ((rows == 1) | (rows == 12))
+    np.testing.assert_allclose(pixels[:, 1], rows + outline + view.v0, atol=2e-3)
+    outline = OUTLINE_PIXELS * np.sign(columns - 8) * ((columns == 1) | (columns == 15))
+    np.testing.assert_allclose(pixels[:, 0], columns + outline + view.u0, atol=2e-3)
     np.testing.assert_allclose(depths_m, depth[rows, columns] / 1000, atol=1e-4)
-    np.testing.assert_array_equal(mesh.colours, view.colour[rows, columns])
-    assert (mesh.vertices.dtype, mesh.faces.dtype, mesh.colours.dtype) == (np.float32, np.int32, np.uint8)
+    assert (mesh.vertices.dtype, mesh.faces.dtype, mesh.uv.dtype) == (np.float32, np.int32, np.float32)
+
+
+@pytest.mark.parametrize("stride", [1, 2, 3])
+def test_each_vertex_has_the_colour_of_where_it_is_seen(stride: int) -> None:
+    view = view_of(block())
+    mesh = mesh_view(view, stride)
+    pixels, _ = project(CAMERA, mesh.vertices)
+    np.testing.assert_allclose(texels(mesh), pixels - [view.u0, view.v0], atol=2e-3)
+    assert mesh.texture is view.colour
+
+
+def test_the_texture_is_not_left_where_the_person_touches_its_border() -> None:
+    view = view_of(np.full((12, 15), 2000, np.uint16))
+    at = texels(mesh_view(view, 2))
+    np.testing.assert_allclose([at.min(axis=0), at.max(axis=0)], [[0, 0], [14, 11]], atol=1e-5)
 
 
 def test_triangles_face_the_camera() -> None:
@@ -93,18 +115,33 @@ def test_a_cell_is_cut_along_its_flatter_diagonal() -> None:
     assert np.count_nonzero(mesh.faces == 0) == 1
 
 
-def test_stride_takes_every_second_pixel() -> None:
+def test_stride_takes_one_pixel_of_each_square() -> None:
     view = view_of(np.full((12, 15), 2000, np.uint16))
     mesh = mesh_view(view, stride=2)
-    pixels, _ = project(CAMERA, mesh.vertices)
-    assert len(mesh.vertices) == 6 * 8
-    np.testing.assert_allclose(pixels[:2], [[10, 5], [12, 5]], atol=2e-3)
-    np.testing.assert_array_equal(mesh.colours[1], view.colour[0, 2])
+    assert (len(mesh.vertices), len(mesh.faces)) == (6 * 8, 2 * 5 * 7)
+    inside = texels(mesh)[8 + 1 : 8 + 4]
+    np.testing.assert_allclose(inside, [[2, 2], [4, 2], [6, 2]], atol=1e-4)
+
+
+@pytest.mark.parametrize("stride", [2, 3])
+@pytest.mark.parametrize("shift", [0, 1, 2])
+def test_a_coarse_grid_keeps_the_outline(shift: int, stride: int) -> None:
+    depth = np.zeros((30, 40), np.uint16)
+    depth[4 + shift : 21 + shift, 5 + shift : 25 + shift] = 2000
+    depth[10 + shift : 14 + shift, 25 + shift : 35 + shift] = 2000  # an arm of four pixels
+    rows, columns = np.nonzero(depth)
+    mesh = mesh_view(view_of(depth), stride)
+    at = texels(mesh)
+    out = OUTLINE_PIXELS
+    np.testing.assert_allclose(at.min(axis=0), [columns.min() - out, rows.min() - out], atol=1e-3)
+    np.testing.assert_allclose(at.max(axis=0), [columns.max() + out, rows.max() + out], atol=1e-3)
+    arm = at[at[:, 0] > 25 + shift]
+    np.testing.assert_allclose([arm[:, 1].min(), arm[:, 1].max()], [10 + shift - out, 13 + shift + out], atol=1e-3)
 
 
 def test_empty_view_gives_an_empty_mesh() -> None:
     mesh = mesh_view(view_of(np.zeros((4, 4), np.uint16)))
-    assert (mesh.vertices.shape, mesh.faces.shape, mesh.colours.shape) == ((0, 3), (0, 3), (0, 3))
+    assert (mesh.vertices.shape, mesh.faces.shape, mesh.uv.shape) == ((0, 3), (0, 3), (0, 2))
 
 
 def test_stride_below_one_is_refused() -> None:

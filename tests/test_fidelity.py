@@ -1,17 +1,11 @@
 """The measures of every report, against cases whose answer is known."""
 
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from common.geometry.camera_model import project
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))
-
-from fidelity import (
+from scripts.fidelity import (
     IMAGE_PIXELS,
     bounding_ball_radius,
     compare,

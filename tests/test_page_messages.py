@@ -6,6 +6,7 @@ import dataclasses
 import json
 import struct
 
+import cv2
 import numpy as np
 import pytest
 from hypothesis import given
@@ -24,14 +25,31 @@ PERSON = capsule_person(pose_id=7)
 def trimmed(vertices: int) -> RiggedMesh:
     """The person's first vertices and one face, so that every remainder of the padding occurs."""
     mesh = TriangleMesh(
-        PERSON.mesh.vertices[:vertices], np.array([[0, 1, vertices - 1]], np.int32), PERSON.mesh.colours[:vertices]
+        PERSON.mesh.vertices[:vertices],
+        np.array([[0, 1, vertices - 1]], np.int32),
+        PERSON.mesh.uv[:vertices],
+        PERSON.mesh.texture,
     )
     return dataclasses.replace(
         PERSON, mesh=mesh, vertex_link=PERSON.vertex_link[:vertices], faces_drawn=mesh.faces.copy()
     )
 
 
-@pytest.mark.parametrize("mesh", [PERSON, *(trimmed(n) for n in (3, 4, 5, 6))], ids=lambda m: str(len(m.vertex_link)))
+def large() -> RiggedMesh:
+    """More vertices than 16-bit indices reach."""
+    mesh, copies = PERSON.mesh, 65537 // len(PERSON.mesh.vertices) + 1
+    faces = np.concatenate([mesh.faces, mesh.faces + (copies - 1) * len(mesh.vertices)]).astype(np.int32)
+    many = TriangleMesh(np.tile(mesh.vertices, (copies, 1)), faces, np.tile(mesh.uv, (copies, 1)), mesh.texture)
+    return dataclasses.replace(PERSON, mesh=many, vertex_link=np.tile(PERSON.vertex_link, copies), faces_drawn=faces)
+
+
+def padded(length: int) -> int:
+    return (length + 3) // 4 * 4
+
+
+@pytest.mark.parametrize(
+    "mesh", [PERSON, large(), *(trimmed(n) for n in (3, 4, 5, 6))], ids=lambda m: str(len(m.vertex_link))
+)
 def test_pose_message_holds_the_mesh(mesh: RiggedMesh) -> None:
     message = page_messages.encode_pose(mesh)
     version, kind, zero, pose_id, vertices, faces = struct.unpack_from("<BBHIII", message)
@@ -39,15 +57,31 @@ def test_pose_message_holds_the_mesh(mesh: RiggedMesh) -> None:
     assert (vertices, faces) == (len(mesh.mesh.vertices), len(mesh.faces_drawn))
     box_min, box_size = np.frombuffer(message, "<f4", 6, 16).reshape(2, 3)
     quantized = np.frombuffer(message, "<u2", 3 * vertices, 40).reshape(-1, 3)
-    colour_offset = 40 + (6 * vertices + 3) // 4 * 4
-    colour_link = np.frombuffer(message, np.uint8, 4 * vertices, colour_offset).reshape(-1, 4)
-    index = np.frombuffer(message, "<u4", 3 * faces, colour_offset + 4 * vertices).reshape(-1, 3)
+    uv_offset = 40 + padded(6 * vertices)
+    uv = np.frombuffer(message, "<u2", 2 * vertices, uv_offset).reshape(-1, 2) / 65535
+    links = np.frombuffer(message, np.uint8, vertices, uv_offset + 4 * vertices)
+    index_offset = uv_offset + 4 * vertices + padded(vertices)
+    index_type = np.dtype("<u2" if vertices <= 65536 else "<u4")
+    index = np.frombuffer(message, index_type, 3 * faces, index_offset).reshape(-1, 3)
+    jpeg = message[index_offset + padded(3 * faces * index_type.itemsize) :]
+    texture = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR_RGB)
 
-    assert len(message) == colour_offset + 4 * vertices + 12 * faces
     assert np.abs(box_min + box_size * (quantized / 65535) - mesh.mesh.vertices).max() < 2e-5  # half a step of 1.9 m
-    np.testing.assert_array_equal(colour_link[:, :3], mesh.mesh.colours)
-    np.testing.assert_array_equal(colour_link[:, 3], mesh.vertex_link)
+    assert np.abs(uv - mesh.mesh.uv).max() < 1e-5
+    np.testing.assert_array_equal(links, mesh.vertex_link)
     np.testing.assert_array_equal(index, mesh.faces_drawn)
+    assert texture is not None
+    assert texture.shape == mesh.mesh.texture.shape
+    assert np.abs(texture.astype(int) - mesh.mesh.texture).max() <= 3
+
+
+def test_texture_keeps_the_colour_of_single_pixels() -> None:
+    stripes = np.tile(np.array([[200, 60, 60], [60, 60, 200]], np.uint8), (16, 16, 1))
+    mesh = dataclasses.replace(PERSON, mesh=dataclasses.replace(PERSON.mesh, texture=stripes))
+    message = page_messages.encode_pose(mesh)
+    texture = cv2.imdecode(np.frombuffer(message[message.index(b"\xff\xd8\xff") :], np.uint8), cv2.IMREAD_COLOR_RGB)
+    assert texture is not None
+    assert np.abs(texture.astype(int) - stripes).max() < 20  # chroma at half resolution would give violet
 
 
 def test_flat_mesh_keeps_its_plane() -> None:
@@ -66,8 +100,10 @@ def test_flat_mesh_keeps_its_plane() -> None:
         dataclasses.replace(PERSON, faces_drawn=np.zeros((0, 3), np.int32)),
         dataclasses.replace(PERSON, vertex_link=PERSON.vertex_link[:-1]),
         dataclasses.replace(PERSON, faces_drawn=np.array([[0, 1, len(PERSON.vertex_link)]], np.int32)),
+        dataclasses.replace(PERSON, mesh=dataclasses.replace(PERSON.mesh, uv=PERSON.mesh.uv[1:])),
+        dataclasses.replace(PERSON, mesh=dataclasses.replace(PERSON.mesh, texture=np.zeros((8, 8193, 3), np.uint8))),
     ],
-    ids=["no face", "a link short", "a face too far"],
+    ids=["no face", "a link short", "a face too far", "a uv short", "a texture too wide"],
 )
 def test_mesh_that_cannot_be_shown_is_refused(broken: RiggedMesh) -> None:
     with pytest.raises(ValueError, match="pose 7"):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from common.body.depth_mesher import mesh_view
-from common.body.rigged_mesh import DRAWN_EDGE_M, DRAWN_LINK_STEPS, build_rigged_mesh
+from common.body.rigged_mesh import DRAWN_EDGE_M, DRAWN_LINK_STEPS, MESH_STRIDE, build_rigged_mesh
 from common.body.skeleton import LINK_COUNT, LINK_INDEX, LINK_PARENTS
 from common.body.skinning import animate_rigid, link_motion
 from common.body.view import View
@@ -24,12 +24,28 @@ def all_edges() -> set[tuple[int, int]]:
 
 
 def test_all_views_are_in_it() -> None:
-    counts = [len(mesh_view(view).vertices) for view in capsule_views(arms_down_by(ANGLE_RAD))]
-    assert len(MESH.mesh.vertices) == sum(counts) == len(MESH.vertex_link) == len(MESH.mesh.colours)
+    counts = [len(mesh_view(view, MESH_STRIDE).vertices) for view in capsule_views(arms_down_by(ANGLE_RAD))]
+    assert len(MESH.mesh.vertices) == sum(counts) == len(MESH.vertex_link) == len(MESH.mesh.uv)
     owner = np.repeat(np.arange(4), counts)[MESH.mesh.faces]
     assert (owner == owner[:, :1]).all()  # views stay separate surfaces
     assert set(owner[:, 0]) == {0, 1, 2, 3}
     assert (MESH.pose_id, MESH.capture_ns) == (7, 123)
+
+
+def test_each_view_keeps_its_part_of_the_texture() -> None:
+    views = capsule_views(arms_down_by(ANGLE_RAD))
+    meshes = [mesh_view(view, MESH_STRIDE) for view in views]
+    texture = MESH.mesh.texture
+    assert texture.shape == (max(v.colour.shape[0] for v in views), sum(v.colour.shape[1] for v in views), 3)
+    left = first = 0
+    for view, mesh in zip(views, meshes, strict=True):
+        h, w = view.colour.shape[:2]
+        np.testing.assert_array_equal(texture[:h, left : left + w], view.colour)
+        own = MESH.mesh.uv[first : first + len(mesh.uv)] * texture.shape[1::-1] - [left, 0]
+        np.testing.assert_allclose(own, mesh.uv * [w, h], atol=1e-3)
+        assert own.min() > 0.499
+        assert (own.max(axis=0) < [w - 0.499, h - 0.499]).all()  # a blend of its own pixels only
+        left, first = left + w, first + len(mesh.uv)
 
 
 def test_link_frames_are_those_of_the_capture() -> None:
@@ -123,6 +139,15 @@ def test_views_without_a_surface_are_refused() -> None:
     for views in ((), (nothing,)):
         with pytest.raises(ValueError, match="pose 3"):
             build_rigged_mesh(3, 0, SKELETON, arms_down_by(0), views)
+
+
+def test_a_person_of_whom_nothing_can_be_drawn_is_refused() -> None:
+    camera = ring_camera(0)
+    steps = np.zeros((8, 8), np.uint16)
+    steps[::2], steps[1::2] = 2000, 2500  # every triangle spans half a metre
+    view = View(camera, 90, 60, np.repeat(np.repeat(steps, 2, axis=0), 2, axis=1), np.zeros((16, 16, 3), np.uint8))
+    with pytest.raises(ValueError, match=r"pose 3: nothing of its \d+ triangles"):
+        build_rigged_mesh(3, 0, SKELETON, arms_down_by(0), [view])
 
 
 def test_every_link_is_known() -> None:

@@ -1,6 +1,7 @@
 """Newest wins: order, duplicates, epochs and packets from the future."""
 
 import pytest
+
 from common.body.skeleton_pose import rest_pose
 from common.wire.skeleton_packet import SkeletonPacket
 from receiver.skeleton_buffer import RETIRED_EPOCHS, SkeletonBuffer

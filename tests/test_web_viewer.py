@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 import asyncio
+import dataclasses
 import json
 import struct
+import threading
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import Any
 
 import aiohttp
+import numpy as np
 import pytest
 from aiohttp import web
 from aiohttp.test_utils import TestServer
 
+from common.body.rigged_mesh import RiggedMesh
 from receiver.viewer import page_messages, web_viewer
 from receiver.viewer.page_messages import FRAME, POSE, REMOVE
 from receiver.viewer.viewer import ConnectionState, ViewerStatus
@@ -161,7 +165,9 @@ async def test_late_page_gets_what_is_there_now() -> None:
             assert isinstance(status, dict)
             assert (hello["kind"], hello["version"]) == ("hello", page_messages.VERSION)
             assert (status["connection"], status["repository_poses"]) == ("receiving", 2)
-            assert await page.binaries(3) == [(POSE, 1), (FRAME, 4), (POSE, 2)]  # what is on screen comes first
+            binaries = await page.binaries(3)
+            assert sorted(binaries) == [(POSE, 1), (POSE, 2), (FRAME, 4)]
+            assert binaries.index((POSE, 1)) < binaries.index((POSE, 2))  # what is on screen comes first
             assert await page.silent()
 
 
@@ -184,6 +190,55 @@ async def test_pose_id_used_again_is_uploaded_again() -> None:
         served.viewer.remove_pose(1)
         served.viewer.add_pose(capsule_person(1))
         assert await page.binaries(1) == [(POSE, 1)]
+
+
+async def test_pose_is_encoded_once_when_the_first_page_needs_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    encoded_on = []
+
+    def encode(mesh: RiggedMesh) -> bytes:
+        encoded_on.append(threading.current_thread())
+        return page_messages.encode_pose(mesh)
+
+    monkeypatch.setattr(web_viewer, "encode_pose", encode)
+    async with serve() as served:
+        served.viewer.add_pose(PERSON)
+        served.viewer.show(shown_frame(PERSON, 0.0))
+        await asyncio.sleep(0.05)
+        assert encoded_on == []
+        for _ in range(2):
+            async with served.page() as page:
+                assert (POSE, 1) in await page.binaries(2)
+        assert len(encoded_on) == 1
+        assert encoded_on[0] is not threading.current_thread()
+
+
+async def test_frames_do_not_wait_for_a_pose_that_is_being_encoded(monkeypatch: pytest.MonkeyPatch) -> None:
+    go_on = threading.Event()
+
+    def encode(mesh: RiggedMesh) -> bytes:
+        assert go_on.wait(LIMIT_S)
+        return page_messages.encode_pose(mesh)
+
+    monkeypatch.setattr(web_viewer, "encode_pose", encode)
+    async with serve() as served, served.page() as page:
+        served.viewer.add_pose(PERSON)
+        served.viewer.add_pose(capsule_person(2))
+        for sequence in range(3):
+            served.viewer.show(shown_frame(PERSON, 0.0, sequence))
+            assert await page.binaries(1) == [(FRAME, sequence)]
+        served.viewer.remove_pose(2)  # it leaves while it is encoded: no page hears of it
+        go_on.set()
+        assert await page.binaries(1) == [(POSE, 1)]
+        assert await page.silent()
+
+
+async def test_pose_that_cannot_be_shown_is_left_out_and_the_others_come(caplog: pytest.LogCaptureFixture) -> None:
+    wide = dataclasses.replace(PERSON.mesh, texture=np.zeros((8, 8193, 3), np.uint8))
+    async with serve() as served, served.page() as page:
+        served.viewer.add_pose(dataclasses.replace(PERSON, pose_id=9, mesh=wide))
+        served.viewer.add_pose(PERSON)
+        assert await page.binaries(1) == [(POSE, 1)]
+        assert "pose 9" in caplog.text
 
 
 async def test_slow_page_skips_to_the_newest_frame_and_delays_nobody() -> None:

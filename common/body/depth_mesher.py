@@ -18,24 +18,31 @@ from common.geometry.triangle_mesh import TriangleMesh
 
 SMOOTHING_RADIUS_PIXELS = 2
 SMOOTHING_RANGE_MM = 50.0  # depths further apart belong to different surfaces; a sensor's steps are smaller
+# A pixel is an area: the person goes on beyond the middle of the outermost ones. Measured: 0.3 gives the best
+# silhouettes and pictures, 0.5 carries surfaces that turn away too far out.
+OUTLINE_PIXELS = 0.3
 
 
 def mesh_view(view: View, stride: int = 1) -> TriangleMesh:
-    """Mesh one view's foreground, ``stride`` pixels between neighbouring vertices; colours are the pixels'.
+    """Mesh one view's foreground: one vertex in every square of ``stride`` pixels; the texture is the view's colour.
 
-    Vertices (V, 3) float32 [m, world], V = foreground pixels on the stride grid, row by row; triangles face the
-    camera. V and F are 0 for an empty view. Depth is smoothed within surfaces; no foreground pixel is lost.
+    Vertices (V, 3) float32 [m, world], square by square in rows; triangles face the camera. V and F are 0 for an
+    empty view. Depth is smoothed within surfaces at full resolution. At the outline the square's outermost
+    foreground pixel is taken: a coarser grid keeps the silhouette, and thin parts.
 
     Raises:
         ValueError: a stride below 1.
     """
     if stride < 1:
         raise ValueError(f"stride {stride} is below 1")
-    depth = smooth_depth(view.depth_mm, SMOOTHING_RADIUS_PIXELS, SMOOTHING_RANGE_MM)[::stride, ::stride]
-    index, pixels, depths_m, colours = _grid_vertices(depth, view.colour[::stride, ::stride])
-    rays = _rays(view.camera, pixels * np.float32(stride) + np.array([view.u0, view.v0], np.float32))
+    depth = smooth_depth(view.depth_mm, SMOOTHING_RADIUS_PIXELS, SMOOTHING_RANGE_MM)
+    index, grid_depth, pixels = _grid_vertices(depth, stride, np.float32(OUTLINE_PIXELS))
+    rays = _rays(view.camera, pixels + np.array([view.u0, view.v0], np.float32))
+    depths_m = grid_depth[index >= 0] * np.float32(1e-3)
     vertices = transform_points(view.camera.T_world_camera, rays * depths_m[:, None])
-    return TriangleMesh(vertices, _grid_faces(depth, index), colours)
+    size = np.array(depth.shape[::-1], np.float32)
+    uv = (np.clip(pixels, 0, size - 1) + np.float32(0.5)) / size
+    return TriangleMesh(vertices, _grid_faces(grid_depth, index), uv, view.colour)
 
 
 def smooth_depth(depth_mm: NDArray[np.uint16], radius: int, range_mm: float) -> NDArray[np.float32]:
@@ -84,25 +91,50 @@ def _smooth(depth_mm, radius, range_mm):  # type: ignore[no-untyped-def]
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
-def _grid_vertices(depth, colour):  # type: ignore[no-untyped-def]
-    """Grid of vertex numbers (-1 = none), and of each vertex its grid column and row, depth [m] and colour."""
-    rows, columns = depth.shape
+def _grid_vertices(depth, stride, outline):  # type: ignore[no-untyped-def]
+    """Per square its vertex number (-1 = none) and depth; per vertex its column and row, moved out by ``outline``."""
+    rows, columns = (depth.shape[0] + stride - 1) // stride, (depth.shape[1] + stride - 1) // stride
+    covered = _covered_squares(depth, stride, rows, columns)
     index = np.full((rows, columns), -1, np.int32)
+    grid_depth = np.zeros((rows, columns), np.float32)
     pixels = np.empty((rows * columns, 2), np.float32)
-    depths_m = np.empty(rows * columns, np.float32)
-    colours = np.empty((rows * columns, 3), np.uint8)
     count = 0
     for r in range(rows):
         for c in range(columns):
-            if depth[r, c] == 0:
+            if not covered[r + 1, c + 1]:
                 continue
-            pixels[count, 0], pixels[count, 1] = c, r
-            depths_m[count] = depth[r, c] * np.float32(1e-3)
-            for k in range(3):
-                colours[count, k] = colour[r, c, k]
+            right = np.int64(covered[r + 1, c]) - np.int64(covered[r + 1, c + 2])  # 1: nothing further right, -1: left
+            down = np.int64(covered[r, c + 1]) - np.int64(covered[r + 2, c + 1])
+            y, x = _outermost(depth, r * stride, c * stride, stride, down, right)
+            pixels[count, 0], pixels[count, 1] = x + outline * right, y + outline * down
+            grid_depth[r, c] = depth[y, x]
             index[r, c] = count
             count += 1
-    return index, pixels[:count].copy(), depths_m[:count].copy(), colours[:count].copy()
+    return index, grid_depth, pixels[:count].copy()
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _covered_squares(depth, stride, rows, columns):  # type: ignore[no-untyped-def]
+    """Whether a square holds foreground, with a border of squares that do not."""
+    covered = np.zeros((rows + 2, columns + 2), np.bool_)
+    for y in range(depth.shape[0]):
+        for x in range(depth.shape[1]):
+            if depth[y, x] > 0:
+                covered[y // stride + 1, x // stride + 1] = True
+    return covered
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _outermost(depth, top, left, stride, down, right):  # type: ignore[no-untyped-def]
+    """Row and column of a covered square's foreground pixel that is furthest ``down`` and ``right`` (1, 0 or -1)."""
+    found = top, left
+    furthest = -4 * stride
+    for y in range(top, min(top + stride, depth.shape[0])):
+        for x in range(left, min(left + stride, depth.shape[1])):
+            if depth[y, x] > 0 and down * (y - top) + right * (x - left) > furthest:
+                furthest = down * (y - top) + right * (x - left)
+                found = y, x
+    return found
 
 
 @njit(nogil=True, cache=True, error_model="numpy")

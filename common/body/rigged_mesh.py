@@ -20,6 +20,8 @@ from common.body.view import View
 from common.geometry.rigid_transform import inverse
 from common.geometry.triangle_mesh import TriangleMesh
 
+MESH_STRIDE = 2  # pixels from vertex to vertex: a quarter of the triangles, and the texture keeps every pixel's colour
+
 # Triangles that count in σ but are not drawn: longer edges bridge an occlusion and hang like a skirt; links further
 # apart in the tree only touch (a hand at the thigh), and a web spans between them when they part.
 DRAWN_EDGE_M = 0.06
@@ -86,7 +88,8 @@ class RiggedMesh:
         arrays = (
             self.mesh.vertices,
             self.mesh.faces,
-            self.mesh.colours,
+            self.mesh.uv,
+            self.mesh.texture,
             self.vertex_link,
             edges.vertices,
             edges.points,
@@ -100,15 +103,19 @@ def build_rigged_mesh(
     """Mesh all views of one instant and rig them to the skeleton of that instant.
 
     Raises:
-        ValueError: the views hold no triangle.
+        ValueError: the views hold no triangle that can be drawn.
     """
-    mesh = _merged([mesh_view(view) for view in views])
+    if not views:
+        raise ValueError(f"pose {pose_id}: no views")
+    mesh = _merged([mesh_view(view, MESH_STRIDE) for view in views])
     if len(mesh.faces) == 0:
         raise ValueError(f"pose {pose_id}: its {len(views)} views hold no surface")
     T_world_link = forward_kinematics(skeleton, pose)
     T_link_world = inverse(T_world_link.astype(np.float64)).astype(np.float64)
     vertex_link = nearest_link(mesh.vertices, skeleton, T_world_link)
     mesh, drawn_count = _drawn_first(mesh, vertex_link)
+    if drawn_count == 0:
+        raise ValueError(f"pose {pose_id}: nothing of its {len(mesh.faces)} triangles can be drawn")
     edges = joint_edges(mesh, vertex_link, T_link_world)
     return RiggedMesh(
         pose_id, capture_ns, skeleton, pose, T_link_world, mesh, vertex_link, mesh.faces[:drawn_count], edges
@@ -144,14 +151,22 @@ def joint_edges(mesh: TriangleMesh, vertex_link: NDArray[np.uint8], T_link_world
 
 
 def _merged(meshes: Sequence[TriangleMesh]) -> TriangleMesh:
-    """One mesh of several, their surfaces unconnected."""
-    if not meshes:
-        return TriangleMesh(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32), np.zeros((0, 3), np.uint8))
+    """One mesh of one or more, their surfaces unconnected, their textures side by side in one atlas."""
     first = np.cumsum([0, *(len(m.vertices) for m in meshes[:-1])], dtype=np.int32)
+    lefts = np.cumsum([0, *(m.texture.shape[1] for m in meshes[:-1])])
+    height, width = max(m.texture.shape[0] for m in meshes), sum(m.texture.shape[1] for m in meshes)
+    atlas = np.empty((height, width, 3), np.uint8)
+    uv = []
+    for m, left in zip(meshes, lefts, strict=True):
+        h, w = m.texture.shape[:2]
+        atlas[:h, left : left + w] = m.texture
+        atlas[h:, left : left + w] = m.texture[-1]  # below it goes on: a step would ring in a JPEG
+        uv.append((m.uv * np.array([w, h], np.float32) + np.array([left, 0], np.float32)) / np.float32([width, height]))
     return TriangleMesh(
         np.concatenate([m.vertices for m in meshes]),
         np.concatenate([m.faces + offset for m, offset in zip(meshes, first, strict=True)]),
-        np.concatenate([m.colours for m in meshes]),
+        np.concatenate(uv),
+        atlas,
     )
 
 
@@ -159,7 +174,7 @@ def _drawn_first(mesh: TriangleMesh, vertex_link: NDArray[np.uint8]) -> tuple[Tr
     """The mesh with its drawn triangles in front, and their number: what is drawn is then a slice, not a copy."""
     drawn = _drawn(mesh.vertices, mesh.faces, vertex_link, _LINK_STEPS <= DRAWN_LINK_STEPS, np.float32(DRAWN_EDGE_M**2))
     faces = np.concatenate([mesh.faces[drawn], mesh.faces[~drawn]])
-    return TriangleMesh(mesh.vertices, faces, mesh.colours), int(np.count_nonzero(drawn))
+    return TriangleMesh(mesh.vertices, faces, mesh.uv, mesh.texture), int(np.count_nonzero(drawn))
 
 
 @njit(nogil=True, cache=True, error_model="numpy")

@@ -1,4 +1,4 @@
-"""A triangle mesh with vertex colours in the world frame."""
+"""A textured triangle mesh in the world frame."""
 
 from __future__ import annotations
 
@@ -11,8 +11,22 @@ from numpy.typing import NDArray
 @dataclass(frozen=True, slots=True, eq=False)
 class TriangleMesh:
     """``vertices`` (V, 3) float32 [m, world]; ``faces`` (F, 3) int32, counter-clockwise seen from outside;
-    ``colours`` (V, 3) uint8 RGB."""
+    ``uv`` (V, 2) float32: place in the texture, 0..1 from its top left corner, the middle of pixel i at
+    (i + 0.5) / size; ``texture`` (h, w, 3) uint8 RGB."""
 
     vertices: NDArray[np.float32]
     faces: NDArray[np.int32]
-    colours: NDArray[np.uint8]
+    uv: NDArray[np.float32]
+    texture: NDArray[np.uint8]
+
+    @property
+    def surface(self) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
+        """What ``rasterizer.render`` paints."""
+        return self.uv, self.texture
+
+    @property
+    def colours(self) -> NDArray[np.uint8]:
+        """Colour (V, 3) uint8 of the texture's pixel at each vertex."""
+        size = np.array(self.texture.shape[1::-1])
+        column, row = np.clip((self.uv * size).astype(int), 0, size - 1).T
+        return self.texture[row, column]

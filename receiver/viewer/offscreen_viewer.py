@@ -69,7 +69,7 @@ class OffscreenViewer:
         frame, mesh = on_screen
         assert frame.motion is not None  # as its pose is not
         vertices = animate_rigid(mesh, frame.motion)
-        return [render(vertices, mesh.faces_drawn, mesh.mesh.colours, camera, BACKGROUND) for camera in cameras]
+        return [render(vertices, mesh.faces_drawn, mesh.mesh.surface, camera, BACKGROUND) for camera in cameras]
 
 
 def _nobody(camera: Camera) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:

@@ -4,7 +4,8 @@ Every binary message begins with ``version u8, kind u8, two zero bytes``; every 
 four bytes, so that the page reads typed arrays in place (``web/src/messages.js`` is the other end).
 
 - POSE, once per candidate pose: ``pose_id u32, vertices V u32, triangles F u32, box_min f32[3], box_size f32[3],
-  position u16[V, 3]`` (0..65535 over the box), padding, ``colour and link u8[V, 4], index u32[F, 3]``.
+  position u16[V, 3]`` (0..65535 over the box), padding, ``uv u16[V, 2]`` (0..65535 over the texture, from its top left
+  corner), ``link u8[V]``, padding, ``index u16[F, 3]`` (u32 if V > 65,536), padding, and the texture as JPEG.
 - FRAME, every skeleton: ``pose_id u32, sequence u32, sigma f32, fit_confidence f32, age_ms f32, motion f32[L, 3, 4],
   joints f32[L, 3], confidence u8[L]``, padding: 1,432 bytes, 0.34 Mbit/s at 30 Hz.
 - REMOVE: ``pose_id u32``.
@@ -20,6 +21,7 @@ import struct
 from dataclasses import asdict
 from typing import TYPE_CHECKING
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -29,10 +31,13 @@ from receiver.viewer.viewer import ShownFrame, ViewerStatus
 if TYPE_CHECKING:
     from common.body.rigged_mesh import RiggedMesh
 
-VERSION = 1
+VERSION = 2
 POSE, FRAME, REMOVE = 1, 2, 3
 NO_POSE = 0xFFFFFFFF
 QUANTIZATION_STEPS = 65535
+SHORT_INDEX_VERTICES = 65536
+JPEG_QUALITY = 90  # above the received views' own: a second coding should add little
+TEXTURE_SIDE_MAX = 8192  # pixels; what browsers' GPUs take
 
 _HEADER = struct.Struct("<BBxx")
 _POSE = struct.Struct("<III3f3f")
@@ -42,25 +47,28 @@ _ACKNOWLEDGEMENT = struct.Struct("<I")
 
 
 def encode_pose(mesh: RiggedMesh) -> bytes:
-    """The POSE message of a rigged mesh: its world vertices at capture, colours, links and unstretched triangles.
+    """The POSE message of a rigged mesh: world vertices at capture, texture, links and unstretched triangles.
 
-    Positions are rounded to 1/65535 of the mesh's bounding box: 0.03 mm for a person.
+    Positions are rounded to 1/65535 of the mesh's bounding box: 0.03 mm for a person. Takes milliseconds.
 
     Raises:
-        ValueError: an empty mesh, or one whose arrays do not fit each other.
+        ValueError: an empty mesh, arrays that do not fit each other, or a texture over 8192 pixels wide or high.
     """
-    vertices, colours, faces = mesh.mesh.vertices, mesh.mesh.colours, mesh.faces_drawn
+    vertices, faces, uv = mesh.mesh.vertices, mesh.faces_drawn, mesh.mesh.uv
     count = len(vertices)
     if count == 0 or len(faces) == 0:
         raise ValueError(f"pose {mesh.pose_id}: an empty mesh cannot be shown")
-    if len(colours) != count or len(mesh.vertex_link) != count or not 0 <= int(faces.max()) < count:
-        raise ValueError(f"pose {mesh.pose_id}: colours, links or faces do not match {count} vertices")
+    if len(uv) != count or len(mesh.vertex_link) != count or not 0 <= int(faces.max()) < count:
+        raise ValueError(f"pose {mesh.pose_id}: texture coordinates, links or faces do not match {count} vertices")
+    if max(mesh.mesh.texture.shape) > TEXTURE_SIDE_MAX:
+        raise ValueError(f"pose {mesh.pose_id}: a texture of {mesh.mesh.texture.shape[1::-1]} pixels is too large")
     box_min = vertices.min(axis=0)
     box_size = np.maximum(vertices.max(axis=0) - box_min, np.float32(1e-6))
     position = np.rint((vertices - box_min) * (QUANTIZATION_STEPS / box_size)).astype("<u2")
-    colour_link = np.column_stack((colours, mesh.vertex_link)).astype(np.uint8)
+    index = faces.astype("<u2" if count <= SHORT_INDEX_VERTICES else "<u4")
+    parts = (position, np.rint(uv * QUANTIZATION_STEPS).astype("<u2"), mesh.vertex_link, index)
     head = _HEADER.pack(VERSION, POSE) + _POSE.pack(mesh.pose_id, count, len(faces), *box_min, *box_size)
-    return b"".join((head, _padded(position.tobytes()), colour_link.tobytes(), faces.astype("<u4").tobytes()))
+    return b"".join((head, *(_padded(part.tobytes()) for part in parts), _jpeg(mesh.mesh.texture)))
 
 
 def encode_frame(frame: ShownFrame) -> bytes:
@@ -102,6 +110,13 @@ def decode_acknowledgement(message: bytes) -> int:
 
 def _floats(values: NDArray[np.float32]) -> bytes:
     return np.ascontiguousarray(values, "<f4").tobytes()
+
+
+def _jpeg(texture: NDArray[np.uint8]) -> bytes:
+    settings = [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY]
+    settings += [cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444]
+    _, jpeg = cv2.imencode(".jpg", cv2.cvtColor(texture, cv2.COLOR_RGB2BGR), settings)
+    return jpeg.tobytes()
 
 
 def _padded(part: bytes) -> bytes:

@@ -3,7 +3,7 @@
 Nothing is queued for a page. The viewer holds what should be seen now (the repository's poses, the newest frame, the
 newest status); each page's own task sends the difference between that and what the page has, and never has more than
 a few messages under way. So a slow page skips frames, a late one catches up by itself, and memory is bounded by the
-repository.
+repository. A pose is encoded on a thread when the first page lacks it; without a page none is.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ from __future__ import annotations
 import asyncio
 import logging
 from collections.abc import Iterable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 from urllib.parse import urlsplit
@@ -60,7 +61,7 @@ class WebViewer:
         self._page_folder = page_folder
         self._allowed_hosts = LOOPBACK_HOSTS | frozenset(allowed_hosts)
         self._heartbeat_s = heartbeat_s
-        self._poses: dict[int, bytes] = {}
+        self._poses: dict[int, _HeldPose] = {}
         self._frame: bytes | None = None
         self._pose_on_screen: int | None = None
         self._status = encode_status(ViewerStatus())
@@ -72,12 +73,8 @@ class WebViewer:
         return len(self._pages)
 
     def add_pose(self, mesh: RiggedMesh) -> None:
-        """Uploads the mesh to every page once.
-
-        Raises:
-            ValueError: a mesh that cannot be shown (empty, or its arrays do not fit each other).
-        """
-        self._poses[mesh.pose_id] = encode_pose(mesh)
+        """Uploads the mesh to every page once; one that cannot be shown (too large a texture) is logged."""
+        self._poses[mesh.pose_id] = _HeldPose(mesh)
         for page in self._pages:
             page.poses.discard(mesh.pose_id)  # sent again if the id is used again
         self._wake()
@@ -173,9 +170,10 @@ class WebViewer:
             page.status = self._status
             await page.socket.send_str(page.status)
         missing = self._next_missing(page)
-        if missing is not None:
+        message = None if missing is None else self._pose_message(missing)
+        if missing is not None and message is not None:
             page.poses.add(missing)
-            await page.send(self._poses[missing])
+            await page.send(message)
         if self._frame is not None and page.frame is not self._frame:
             page.frame = self._frame
             await page.send(page.frame)
@@ -185,6 +183,30 @@ class WebViewer:
         """The pose to upload next: the one on screen first, then the newest."""
         missing = self._poses.keys() - page.poses
         return self._pose_on_screen if self._pose_on_screen in missing else max(missing, default=None)
+
+    def _pose_message(self, pose_id: int) -> bytes | None:
+        """The POSE message; None until it is encoded, which the first call starts and whose end wakes the pages."""
+        pose = self._poses[pose_id]
+        if pose.encoding is None:
+            pose.encoding = asyncio.create_task(asyncio.to_thread(encode_pose, pose.mesh))
+            pose.encoding.add_done_callback(lambda _: self._wake())
+        if not pose.encoding.done():
+            return None
+        try:
+            return pose.encoding.result()
+        except ValueError as error:
+            log.warning("a pose is not shown: %s", error)
+            del self._poses[pose_id]
+            self._wake()  # for the next one
+            return None
+
+
+@dataclass(slots=True, eq=False)
+class _HeldPose:
+    """A pose of the repository, and its message once a page lacked it."""
+
+    mesh: RiggedMesh
+    encoding: asyncio.Task[bytes] | None = None
 
 
 class _Page:

@@ -25,7 +25,10 @@ connect({
     hud.setStatus(status);
     setPresence();
   },
-  pose: (message) => person.add(message),
+  async pose(message) {
+    await person.add(message);
+    stage.changed = true;
+  },
   remove: ({ poseId }) => person.remove(poseId),
   frame(frame) {
     newest = { ...frame, capturedAt: performance.now() - frame.ageMs };

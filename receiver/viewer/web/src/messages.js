@@ -1,6 +1,6 @@
 // The page's end of receiver/viewer/page_messages.py: typed arrays read in place, little-endian.
 
-export const VERSION = 1;
+export const VERSION = 2;
 const KINDS = { 1: decodePose, 2: decodeFrame, 3: decodeRemove };
 const NO_POSE = 0xffffffff;
 export const LINKS = 23;
@@ -15,15 +15,21 @@ export function decodeMessage(data) {
 function decodePose(buffer, view) {
   const vertices = view.getUint32(8, true);
   const faces = view.getUint32(12, true);
-  const colourOffset = 40 + align(vertices * 6);
+  const Index = vertices <= 65536 ? Uint16Array : Uint32Array;
+  const uvOffset = 40 + align(vertices * 6);
+  const linkOffset = uvOffset + vertices * 4;
+  const indexOffset = linkOffset + align(vertices);
+  const textureOffset = indexOffset + align(faces * 3 * Index.BYTES_PER_ELEMENT);
   return {
     kind: "pose",
     poseId: view.getUint32(4, true),
     boxMin: new Float32Array(buffer, 16, 3),
     boxSize: new Float32Array(buffer, 28, 3),
     positions: new Uint16Array(buffer, 40, vertices * 3),
-    coloursAndLinks: new Uint8Array(buffer, colourOffset, vertices * 4),
-    indices: new Uint32Array(buffer, colourOffset + vertices * 4, faces * 3),
+    uv: new Uint16Array(buffer, uvOffset, vertices * 2),
+    links: new Uint8Array(buffer, linkOffset, vertices),
+    indices: new Index(buffer, indexOffset, faces * 3),
+    jpeg: new Uint8Array(buffer, textureOffset),
   };
 }
 
