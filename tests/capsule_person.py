@@ -19,6 +19,7 @@ SKELETON: Skeleton = human_skeleton(1.75)
 SHIRT, SKIN, TROUSERS = (60, 120, 220), (230, 170, 130), (90, 75, 65)
 _PALETTE = (SHIRT, SKIN, TROUSERS)
 _PATCH = 16  # pixels of each colour's square in the texture: whole JPEG blocks, which then keep the colour
+_NOBODY = (255, 0, 255)  # where the texture holds no colour of the person: seen if it is mirrored or turned
 _RINGS, _SEGMENTS = 10, 16
 
 
@@ -50,7 +51,7 @@ def capsule_person(pose_id: int = 0, pose: SkeletonPose | None = None) -> Rigged
         np.concatenate(vertices).astype(np.float32),
         np.concatenate([f + per_link * link for link, f in enumerate(faces)]).astype(np.int32),
         np.repeat([_patch_centre(_colour(link)) for link in range(LINK_COUNT)], per_link, axis=0).astype(np.float32),
-        np.tile(np.repeat(np.array(_PALETTE, np.uint8), _PATCH, axis=0), (_PATCH, 1, 1)),
+        _texture(),
     )
     vertex_link = np.repeat(np.arange(LINK_COUNT, dtype=np.uint8), per_link)
     T_link_world = inverse(T_world_link.astype(np.float64))
@@ -74,7 +75,18 @@ def _colour(link: int) -> tuple[int, int, int]:
 
 
 def _patch_centre(colour: tuple[int, int, int]) -> tuple[float, float]:
-    return (_PALETTE.index(colour) + 0.5) / len(_PALETTE), 0.5
+    place = (_PALETTE.index(colour) + 0.5) / len(_PALETTE)
+    return place, place
+
+
+def _texture() -> NDArray[np.uint8]:
+    """A square for each colour, down the diagonal."""
+    side = _PATCH * len(_PALETTE)
+    texture = np.full((side, side, 3), _NOBODY, np.uint8)
+    for index, colour in enumerate(_PALETTE):
+        square = slice(_PATCH * index, _PATCH * (index + 1))
+        texture[square, square] = colour
+    return texture
 
 
 def _links(*parts: str) -> frozenset[int]:

@@ -78,6 +78,28 @@ def test_person_is_in_front_of_the_background_only_where_nearer() -> None:
     assert np.abs(noisy[40:].astype(int) - 3000).max() < 120
 
 
+def test_person_is_measured_as_the_same_surface_in_the_background_is() -> None:
+    wall_alone, person = wall(3.0), wall(2.0, (20, 20))
+    both = wall_alone.copy()
+    both[10:30, 30:50] = person
+    settings = SensorSettings()
+    crop = Crop(30, 10, np.zeros((20, 20, 3), np.uint8), person)
+    sensor = DepthSensor(wall_alone, FOCAL, settings, 1)
+    behind = DepthSensor(both, FOCAL, settings, 2)
+    measured = np.stack([sensor.measure(crop) for _ in range(60)])
+    expected = np.stack([behind.background_reading() for _ in range(60)])
+    around = (slice(None), slice(8, 32), slice(28, 52))
+    missing, also_missing = ((frames[around] == 0).mean(axis=0) for frames in (measured, expected))
+    assert np.abs(missing - also_missing).max() < 0.4  # 60 frames, a pixel
+    for ring in (9, 10, 11):  # the shadow beside the person, their edge, and inside
+        assert measured[:, ring, 31:49].astype(bool).mean() == pytest.approx(
+            expected[:, ring, 31:49].astype(bool).mean(), abs=0.06
+        )
+    inner = (slice(None), slice(12, 28), slice(32, 48))
+    assert np.std(measured[inner].astype(float)) == pytest.approx(np.std(expected[inner].astype(float)), rel=0.1)
+    assert np.mean(measured[inner]) == pytest.approx(np.mean(expected[inner]), abs=1)
+
+
 def test_the_same_seed_gives_the_same_readings() -> None:
     np.testing.assert_array_equal(readings(wall(2.0), 3, seed=5), readings(wall(2.0), 3, seed=5))
     assert (readings(wall(2.0), 3, seed=5) != readings(wall(2.0), 3, seed=6)).any()

@@ -21,7 +21,7 @@ from common.geometry.camera_model import project
 from sender.capture.frame_ring import FrameRing, RingLayout
 from sender.capture.frame_set import CaptureError, DepthFrame
 from sender.capture.rig_layout import RigSettings
-from sender.capture.rig_process import SLOTS, Rig, RigRenderer, listen, main
+from sender.capture.rig_process import SLOTS, Rig, RigRenderer, _reduced, listen, main
 from sender.capture.virtual_rig import VirtualRig
 
 SMALL = RigSettings(cameras=2, width=64, height=48, fps=60)
@@ -171,6 +171,15 @@ def test_a_new_reader_replaces_the_old_one(tmp_path: Path) -> None:
             read_frames(new, 4)
             with pytest.raises(CaptureError, match="ended"):
                 read_frames(old, 100)
+
+
+def test_texture_finer_than_the_pictures_is_averaged_and_a_coarse_one_kept() -> None:
+    checker = np.indices((2048, 1024)).sum(axis=0) % 2 * 200
+    fine = np.repeat(checker[..., None], 3, axis=2).astype(np.uint8)
+    reduced = _reduced(fine, 1024)
+    assert reduced.shape == (1024, 512, 3)
+    assert (reduced == 100).all()
+    np.testing.assert_array_equal(_reduced(fine[:600, :500], 1024), fine[:600, :500])
 
 
 def test_skew_and_dropout_are_those_asked_for(tmp_path: Path) -> None:

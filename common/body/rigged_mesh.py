@@ -156,12 +156,13 @@ def _merged(meshes: Sequence[TriangleMesh]) -> TriangleMesh:
     lefts = np.cumsum([0, *(m.texture.shape[1] for m in meshes[:-1])])
     height, width = max(m.texture.shape[0] for m in meshes), sum(m.texture.shape[1] for m in meshes)
     atlas = np.empty((height, width, 3), np.uint8)
+    size = np.array([width, height], np.float32)
     uv = []
     for m, left in zip(meshes, lefts, strict=True):
         h, w = m.texture.shape[:2]
         atlas[:h, left : left + w] = m.texture
         atlas[h:, left : left + w] = m.texture[-1]  # below it goes on: a step would ring in a JPEG
-        uv.append((m.uv * np.array([w, h], np.float32) + np.array([left, 0], np.float32)) / np.float32([width, height]))
+        uv.append((m.uv * np.array([w, h], np.float32) + np.array([left, 0], np.float32)) / size)
     return TriangleMesh(
         np.concatenate([m.vertices for m in meshes]),
         np.concatenate([m.faces + offset for m, offset in zip(meshes, first, strict=True)]),

@@ -34,6 +34,7 @@ from sender.capture.sensor_model import DepthSensor, SensorSettings, averaged
 SLOTS = 8  # frames per camera in shared memory, ...
 AHEAD = 3  # ... so many of them rendered ahead; a reader may be SLOTS − AHEAD frames behind
 _ROOM_FRAMES = 20  # averaged for the empty room, as an operator would
+_TEXELS = 2  # of a texture's longer side for each pixel of the picture's height
 _START_NS = 300_000_000  # from the first reader to the first frame
 _STATUS_NS = 1_000_000_000
 
@@ -58,8 +59,9 @@ class RigRenderer:
         self._performer = performer
         mesh = performer.mesh
         self._faces = np.ascontiguousarray(mesh.faces, np.int32)
-        textured = mesh.uv is not None and mesh.texture is not None
-        self._surface: Surface = (mesh.uv, mesh.texture) if textured else mesh.vertex_colours  # type: ignore[assignment]
+        self._surface: Surface = mesh.vertex_colours
+        if mesh.uv is not None and mesh.texture is not None:
+            self._surface = np.ascontiguousarray(mesh.uv, np.float32), _reduced(mesh.texture, _TEXELS * settings.height)
         rooms = [room_view(camera) for camera in self.cameras]
         self._room_colours = [colour for colour, _ in rooms]
         sensor = SensorSettings() if settings.noise else None
@@ -77,13 +79,16 @@ class RigRenderer:
         """Fill ``depth`` (H, W) uint16 [mm] and ``colour`` (H, W, 3) uint8 with camera ``camera`` at ``time_s``."""
         if self._posed[0] != time_s:
             self._posed = time_s, self._performer.surface(time_s)
-        crop = render_crop(self._posed[1], self._faces, self._surface, self.cameras[camera], cull_back=True)
         colour[:] = self._room_colours[camera]
-        if crop is not None:
-            h, w = crop.depth.shape
-            part = colour[crop.v0 : crop.v0 + h, crop.u0 : crop.u0 + w]
-            cv2.copyTo(crop.colour, (crop.depth > 0).view(np.uint8), part)
+        mesh = self._posed[1], self._faces, self._surface
+        crop = render_crop(*mesh, self.cameras[camera], cull_back=True, onto=colour)
         self._sensors[camera].measure(crop, depth)
+
+
+def _reduced(texture: np.ndarray, size: int) -> np.ndarray:
+    """The texture (h, w, 3) uint8 at most ``size`` wide and high: a finer one only flickers and misses the cache."""
+    scale = min(size / max(texture.shape[:2]), 1.0)
+    return np.ascontiguousarray(cv2.resize(texture, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA))
 
 
 class Rig:

@@ -54,7 +54,6 @@ class DepthSensor:
         """``background`` (H, W) float32 [m along the optical axis], 0 = nothing there."""
         self._background = np.ascontiguousarray(background, np.float32)
         self._settings = settings
-        self._focal_px = focal_px
         self._random = np.random.default_rng(seed)
         if settings is None:
             return
@@ -63,7 +62,12 @@ class DepthSensor:
         self._noise = (noise * (settings.noise_per_m / settings.step_per_m / noise.std())).ravel()
         self._chance = self._random.integers(0, 255, (h + _SPARE_ROWS) * w, np.uint8)  # 255 in the loss map: always
         self._millimetres = _step_table(settings)
-        self._steps, self._loss = self._measurable(self._background)
+        graze, blind = np.tan([settings.grazing_rad, settings.blind_rad]) / focal_px
+        self._limits = tuple(
+            np.float32(limit)
+            for limit in (1 / settings.step_per_m, settings.max_range_m, settings.edge_m, graze, blind - graze)
+        )
+        self._losses = int(255 * settings.lost_at_edge), int(255 * settings.lost_in_shadow)
         self._readings = [self.background_reading() for _ in range(_BACKGROUNDS)]
 
     def measure(self, person: Crop | None, out: NDArray[np.uint16] | None = None) -> NDArray[np.uint16]:
@@ -71,13 +75,12 @@ class DepthSensor:
         h, w = self._background.shape
         out = np.empty((h, w), np.uint16) if out is None else out
         if self._settings is None:
-            scene = self._background if person is None else self._behind(person, 0)[0]
+            scene = self._background if person is None else self._behind(person, max(h, w))[0]
             np.rint(scene * 1000, casting="unsafe", out=out)
             return out
         out[:] = self._readings[self._random.integers(_BACKGROUNDS)]
         if person is not None:
-            scene, corner = self._behind(person, 1)
-            self._read(*self._measurable(scene), corner, out)
+            self._read(*self._behind(person, 2), out)
         return out
 
     def background_reading(self) -> NDArray[np.uint16]:
@@ -85,42 +88,28 @@ class DepthSensor:
         out = np.empty(self._background.shape, np.uint16)
         if self._settings is None:
             return self.measure(None, out)
-        self._read(self._steps, self._loss, (0, 0), out)
+        self._read(self._background, np.ones(out.shape, np.uint8), (0, 0), out)
         return out
 
     def _read(
-        self, steps: NDArray[np.float32], loss: NDArray[np.uint8], corner: tuple[int, int], out: NDArray[np.uint16]
+        self, scene: NDArray[np.float32], fresh: NDArray[np.uint8], corner: tuple[int, int], out: NDArray[np.uint16]
     ) -> None:
-        """Readings of a part of the image whose corner is at pixel (v0, u0), into the image ``out``."""
+        """Readings of a part of the image whose corner is at pixel (v0, u0), where fresh, into the image ``out``."""
         spare = _SPARE_ROWS * out.shape[1]
         noise, chance = (table[self._random.integers(spare) :] for table in (self._noise, self._chance))
         sign = np.float32(self._random.choice((-1.0, 1.0)))
-        _sample(steps, loss, noise, chance, sign, self._millimetres, corner, out)
+        _read(scene, fresh, self._limits, self._losses, noise, chance, sign, self._millimetres, corner, out)
 
-    def _behind(self, person: Crop, border: int) -> tuple[NDArray[np.float32], tuple[int, int]]:
-        """Depth with the person in front: the whole image, or (border > 0) the crop with a border; and its corner."""
+    def _behind(self, person: Crop, border: int) -> tuple[NDArray[np.float32], NDArray[np.uint8], tuple[int, int]]:
+        """The crop with a border: depth (h, w) with the person in front, where they are, and the corner (v0, u0)."""
         h, w = self._background.shape
         ph, pw = person.depth.shape
-        v0, v1, u0, u1 = 0, h, 0, w
-        if border:
-            v0, v1 = max(person.v0 - border, 0), min(person.v0 + ph + border, h)
-            u0, u1 = max(person.u0 - border, 0), min(person.u0 + pw + border, w)
+        v0, v1 = max(person.v0 - border, 0), min(person.v0 + ph + border, h)
+        u0, u1 = max(person.u0 - border, 0), min(person.u0 + pw + border, w)
         scene = self._background[v0:v1, u0:u1].copy()
-        part = scene[person.v0 - v0 : person.v0 - v0 + ph, person.u0 - u0 : person.u0 - u0 + pw]
-        nearer = (person.depth > 0) & ((person.depth < part) | (part == 0))
-        np.copyto(part, person.depth, where=nearer)
-        return scene, (v0, u0)
-
-    def _measurable(self, depth: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
-        """Disparity in steps (h, w) and how often a pixel is lost, in 255ths (h, w)."""
-        s = self._settings
-        assert s is not None
-        graze = np.float32(np.tan(s.grazing_rad) / self._focal_px), np.float32(np.tan(s.blind_rad) / self._focal_px)
-        losses = (int(255 * s.lost_at_edge), int(255 * s.lost_in_shadow))
-        steps, loss = np.empty(depth.shape, np.float32), np.empty(depth.shape, np.uint8)
-        limits = np.float32(s.max_range_m), np.float32(s.edge_m)
-        _prepare(depth, np.float32(1 / s.step_per_m), *limits, graze, losses, steps, loss)
-        return steps, loss
+        there = np.zeros(scene.shape, np.uint8)
+        _stand_before(scene, there, person.depth, person.v0 - v0, person.u0 - u0)
+        return scene, there, (v0, u0)
 
 
 def averaged(frames: Sequence[NDArray[np.uint16]]) -> NDArray[np.uint16]:
@@ -139,41 +128,53 @@ def _step_table(settings: SensorSettings) -> NDArray[np.uint16]:
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
-def _prepare(depth, steps_m, max_range_m, edge_m, graze, losses, steps, loss):  # type: ignore[no-untyped-def]
-    """Disparity in steps and loss in 255ths of true depth; tan of the angle to the normal ≈ |Δz| · f / z a pixel."""
-    h, w = depth.shape
-    for v in range(h):
-        for u in range(w):
-            z = depth[v, u]
-            if z <= 0 or z > max_range_m:
-                steps[v, u], loss[v, u] = 0, 255
-                continue
-            steps[v, u] = steps_m / z
-            around = (
-                depth[max(v - 1, 0), u], depth[min(v + 1, h - 1), u],
-                depth[v, max(u - 1, 0)], depth[v, min(u + 1, w - 1)],
-            )  # fmt: skip
-            slope, worst = np.float32(0), 0
-            for beside in around:
-                drop = beside - z if beside > 0 else np.float32(1e3)
-                if drop > edge_m:
-                    worst = max(worst, losses[0])
-                elif drop < -edge_m:
-                    worst = max(worst, losses[1])
-                else:
-                    slope = max(slope, abs(drop))
-            grazing = (slope / z - graze[0]) / (graze[1] - graze[0])
-            loss[v, u] = max(worst, int(255 * min(max(grazing, np.float32(0)), np.float32(1))))
+def _stand_before(scene, there, person, top, left):  # type: ignore[no-untyped-def]
+    """The person's depth (h, w) into ``scene`` from (top, left) on, where nearer; there ``there`` becomes 1."""
+    for v in range(person.shape[0]):
+        for u in range(person.shape[1]):
+            z, behind = person[v, u], scene[top + v, left + u]
+            nearer = (z > 0) & ((z < behind) | (behind == 0))
+            scene[top + v, left + u] = z if nearer else behind
+            there[top + v, left + u] = nearer
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
-def _sample(steps, loss, noise, chance, sign, millimetres, corner, out):  # type: ignore[no-untyped-def]
-    """Readings [mm] of (h, w) disparities into ``out`` at pixel ``corner`` (v0, u0); tables run over all of ``out``."""
-    h, w = steps.shape
-    last = len(millimetres) - 1
+def _read(scene, fresh, limits, losses, noise, chance, sign, millimetres, corner, out):  # type: ignore[no-untyped-def]
+    """Readings [mm] of the fresh pixels of ``scene`` (h, w) and of those beside them, as their edges are new.
+
+    They go into ``out`` from pixel ``corner`` (v0, u0) on; the tables of noise and chance run over all of ``out``.
+    ``limits``: disparity steps · m, range, edge, least slope at which readings get lost and the span until all are.
+    """
+    h, w = scene.shape
+    steps_m, max_range_m, _, _, _ = limits
     for v in range(h):
+        above, below = max(v - 1, 0), min(v + 1, h - 1)
         row = (corner[0] + v) * out.shape[1] + corner[1]
         for u in range(w):
-            k = int(steps[v, u] + sign * noise[row + u] + np.float32(0.5))
-            k = min(max(k, 0), last)
-            out[corner[0] + v, corner[1] + u] = millimetres[k] if chance[row + u] >= loss[v, u] else 0
+            before, after = max(u - 1, 0), min(u + 1, w - 1)
+            if not fresh[v, u] | fresh[above, u] | fresh[below, u] | fresh[v, before] | fresh[v, after]:
+                continue
+            z, reading = scene[v, u], np.uint16(0)
+            if z > 0 and z <= max_range_m:
+                around = scene[above, u], scene[below, u], scene[v, before], scene[v, after]
+                if chance[row + u] >= _loss(z, around, limits, losses):
+                    k = int(steps_m / z + sign * noise[row + u] + np.float32(0.5))
+                    reading = millimetres[min(max(k, 0), len(millimetres) - 1)]
+            out[corner[0] + v, corner[1] + u] = reading
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _loss(z, around, limits, losses):  # type: ignore[no-untyped-def]
+    """How often a pixel is lost, in 255ths; tan of the angle to the normal ≈ |Δz| · f / z a pixel."""
+    _, _, edge_m, least_slope, slope_span = limits
+    slope, worst = np.float32(0), 0
+    for beside in around:
+        drop = beside - z if beside > 0 else np.float32(1e3)
+        if drop > edge_m:
+            worst = max(worst, losses[0])
+        elif drop < -edge_m:
+            worst = max(worst, losses[1])
+        else:
+            slope = max(slope, abs(drop))
+    grazing = (slope / z - least_slope) / slope_span
+    return max(worst, int(255 * min(max(grazing, np.float32(0)), np.float32(1))))

@@ -29,7 +29,10 @@ connect({
     await person.add(message);
     stage.changed = true;
   },
-  remove: ({ poseId }) => person.remove(poseId),
+  remove({ poseId }) {
+    person.remove(poseId);
+    stage.changed = true;
+  },
   frame(frame) {
     newest = { ...frame, capturedAt: performance.now() - frame.ageMs };
   },
