@@ -139,6 +139,7 @@ class _Stream:
             source.frame_rate_hz,
             self._timer,
             self._clock,
+            source.start_joints,
         )
 
     def _make_synchronizer(self) -> Synchronizer:

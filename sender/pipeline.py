@@ -16,6 +16,7 @@ from common.body.rigged_mesh import build_rigged_mesh
 from common.body.skeleton import Skeleton
 from common.body.skeleton_pose import SkeletonPose, forward_kinematics
 from common.body.view import View
+from common.geometry.point_cloud import PointCloud
 from common.runtime.clock import Clock
 from common.runtime.stage_timer import StageTimer
 from common.wire.body_message import BodyMessage, encode_body, quantized_skeleton
@@ -24,6 +25,7 @@ from common.wire.skeleton_packet import SkeletonPacket, encode_skeleton, quantiz
 from sender.candidate_poses.usable_pose_set import UsablePoseSet, UsablePoseSettings
 from sender.capture.frame_set import FrameSet
 from sender.config import CandidateSettings
+from sender.fitting.start_joints import skeleton_from_joints
 from sender.fitting.tracker import FitResult, Tracker
 from sender.reconstruction.background import BackgroundModel
 from sender.reconstruction.foreground_points import PointSampler
@@ -43,7 +45,7 @@ class StreamIdentity:
 class TrackedFrame:
     """One frame set after the fast path. ``packet`` is None while nobody has been found. ``body``: a new body message
     to publish before the packet. ``skeleton``, ``pose``: as the receiver will decode them; ``T_world_link`` (L, 4, 4):
-    their forward kinematics."""
+    their forward kinematics. ``complete``: no camera's frame was missing."""
 
     capture_ns: int
     views: tuple[View, ...]
@@ -53,6 +55,7 @@ class TrackedFrame:
     skeleton: Skeleton | None = None
     pose: SkeletonPose | None = None
     T_world_link: NDArray[np.float32] | None = None
+    complete: bool = True
 
 
 class SkeletonPath:
@@ -67,6 +70,7 @@ class SkeletonPath:
         frame_rate_hz: float,
         timer: StageTimer,
         clock: Clock,
+        start_joints: NDArray[np.floating] | None = None,
     ) -> None:
         self._identity = identity
         self._backgrounds = backgrounds
@@ -75,6 +79,7 @@ class SkeletonPath:
         self._frame_rate_hz = frame_rate_hz
         self._timer = timer
         self._clock = clock
+        self._start_joints = start_joints
         self._sequence = 0
         self._revision = 0
         self._body: Skeleton | None = None
@@ -87,18 +92,26 @@ class SkeletonPath:
         with self._timer.stage("points"):
             cloud = self._sampler.points(views)
         with self._timer.stage("fitting"):
-            fit = self._tracker.track(cloud, frames.capture_ns)
+            fit = self._fit(cloud, frames.capture_ns)
         if fit is None:
             return TrackedFrame(frames.capture_ns, views, None)
         with self._timer.stage("packet"):
-            return self._pack(frames.capture_ns, views, fit)
+            return self._pack(frames, views, fit)
 
     def _views(self, frames: FrameSet) -> tuple[View, ...]:
         pairs = zip(self._backgrounds, frames.frames, strict=True)
         views = (background.foreground(frame) for background, frame in pairs if frame is not None)
         return tuple(view for view in views if view is not None)
 
-    def _pack(self, capture_ns: int, views: tuple[View, ...], fit: FitResult) -> TrackedFrame:
+    def _fit(self, cloud: PointCloud, capture_ns: int) -> FitResult | None:
+        if self._start_joints is None or len(cloud) == 0:
+            return self._tracker.track(cloud, capture_ns)
+        skeleton, pose = skeleton_from_joints(self._start_joints)
+        self._start_joints = None
+        return self._tracker.start_from(skeleton, pose, cloud, capture_ns)
+
+    def _pack(self, frames: FrameSet, views: tuple[View, ...], fit: FitResult) -> TrackedFrame:
+        capture_ns = frames.capture_ns
         body, message = self._current_body(fit.skeleton)
         pose = quantized_pose(fit.pose)
         age_ns, previous = (0, None) if self._previous is None else (capture_ns - self._previous[0], self._previous[1])
@@ -118,7 +131,9 @@ class SkeletonPath:
         )
         self._sequence += 1
         self._previous = (capture_ns, fit.pose)
-        return TrackedFrame(capture_ns, views, fit, packet, message, body, pose, forward_kinematics(body, pose))
+        T_world_link = forward_kinematics(body, pose)
+        complete = None not in frames.frames
+        return TrackedFrame(capture_ns, views, fit, packet, message, body, pose, T_world_link, complete)
 
     def _current_body(self, found: Skeleton) -> tuple[Skeleton, bytes | None]:
         """The body the receiver holds, and the message that tells it when it changed."""
@@ -156,9 +171,11 @@ class CandidatePath:
         self._sent: deque[tuple[int, float]] = deque(maxlen=UsablePoseSettings().max_poses)
 
     def may_become_one(self, tracked: TrackedFrame) -> bool:
-        """Whether a frame is fit to become a candidate pose: somebody is seen, and the skeleton is not doubtful."""
+        """Whether a frame is fit to become a candidate pose: somebody is seen, by every camera that is there, and the
+        skeleton is not doubtful."""
         fit = tracked.fit
-        return bool(tracked.views) and fit is not None and fit.confidence >= self._settings.least_confidence
+        seen = bool(tracked.views) and tracked.complete
+        return seen and fit is not None and fit.confidence >= self._settings.least_confidence
 
     def remember(self, tracked: TrackedFrame) -> None:
         """A skeleton was sent: candidate poses are judged by how many of those they animate."""

@@ -22,6 +22,7 @@ class ScriptedSource:
     cameras = ()
     empty_room = ()
     frame_rate_hz = 30.0
+    start_joints = None
 
     def __init__(self, frames: Iterable[DepthFrame], end: Exception) -> None:
         self._frames = iter(frames)

@@ -87,6 +87,7 @@ def test_a_missing_camera_and_an_empty_room_are_survived():
     full = frame_set(20)
     partial = path.process(FrameSet(full.capture_ns, (None, *full.frames[1:])))
     assert len(partial.views) == 3
+    assert not partial.complete
     assert partial.packet is not None
     nobody = path.process(FrameSet(frame_set(21).capture_ns, (None,) * 4))
     assert nobody.views == ()
@@ -102,6 +103,7 @@ def test_a_doubtful_fit_never_becomes_a_candidate():
     doubtful = dataclasses.replace(frame, fit=dataclasses.replace(frame.fit, confidence=0.3))
     assert not path.may_become_one(doubtful)
     assert not path.may_become_one(dataclasses.replace(frame, views=()))
+    assert not path.may_become_one(dataclasses.replace(frame, complete=False))
 
 
 def test_candidates_gather_skeletons_and_their_quotients():

@@ -9,6 +9,7 @@ import scipy.io
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from common.body.skeleton import NAMED_JOINTS
 from common.geometry.camera_model import pixel_rays, project
 from sender.capture.frame_set import CaptureError
 from sender.capture.recorded_rig import RecordedRig, open_recording
@@ -121,3 +122,15 @@ def test_damaged_files_raise_capture_errors_only(data: st.DataObject, tmp_path_f
     file.write_bytes(content[: data.draw(st.integers(1, len(content)))])
     with contextlib.suppress(CaptureError):
         open_recording(file)
+
+
+@with_data
+def test_the_start_joints_are_the_sdks_in_our_order() -> None:
+    recording = sequence("a1_s1")
+    joints, sdk = recording.start_joints, recording.joints(0)
+    assert joints is not None
+    named = {name: joints[row] for row, (name, _) in enumerate(NAMED_JOINTS)}
+    np.testing.assert_array_equal(named["left_wrist"], sdk[6])
+    np.testing.assert_array_equal(named["right_knee"], sdk[17])
+    assert named["pelvis"][1] < named["chest"][1] < named["neck"][1] < named["head"][1] < sdk[0][1]
+    assert named["left_shoulder"][0] > named["right_shoulder"][0]  # facing us, the left hand is at +X

@@ -43,6 +43,8 @@ class FrameSource(Protocol):
     ``read`` blocks up to ``timeout_s`` for the next frame of any camera and returns None when none came in time;
     it raises ``EndOfFrames`` when there will be no more and ``CaptureError`` when the source broke.
     ``empty_room`` is the depth of each camera without a person (H, W) uint16 mm, where the source has one.
+    ``start_joints`` (16, 3) [m, world; ``NAMED_JOINTS`` order] are the person's joints in the first frame, where the
+    source knows them, as a sensor with a tracker of its own does.
     """
 
     @property
@@ -51,6 +53,8 @@ class FrameSource(Protocol):
     def empty_room(self) -> tuple[NDArray[np.uint16] | None, ...]: ...
     @property
     def frame_rate_hz(self) -> float: ...
+    @property
+    def start_joints(self) -> NDArray[np.floating] | None: ...
     def read(self, timeout_s: float) -> DepthFrame | None: ...
     def close(self) -> None: ...
 

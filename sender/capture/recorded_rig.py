@@ -34,6 +34,8 @@ class Recording(Protocol):
     def frame_rate_hz(self) -> float: ...
     @property
     def frames(self) -> tuple[tuple[int, int, int], ...]: ...
+    @property
+    def start_joints(self) -> NDArray[np.floating] | None: ...
     def load(self, camera_index: int, number: int) -> Images:
         """Depth (H, W) uint16 [mm] and colour (H, W, 3) uint8 RGB or None; CaptureError when they cannot be read."""
         ...
@@ -90,6 +92,10 @@ class RecordedRig:
     @property
     def frame_rate_hz(self) -> float:
         return self._recording.frame_rate_hz
+
+    @property
+    def start_joints(self) -> NDArray[np.floating] | None:
+        return self._recording.start_joints
 
     @property
     def epoch_ns(self) -> int | None:

@@ -16,6 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from common.body.skeleton import NAMED_JOINTS
 from common.geometry.camera_model import Camera
 from sender.capture.assumed_pose import assumed_pose
 from sender.capture.camera_record import camera_from_record, camera_to_record
@@ -73,6 +74,7 @@ class RecordingFolder:
                 raise ValueError("no cameras")
             self.cameras = tuple(folder.camera for folder in self._folders)
             self.empty_room = tuple(_empty_room(path, record, self.cameras) for record in content["cameras"])
+            self.start_joints = _start_joints(content.get("start_joints"))
             times = [_times(f, r, self.frame_rate_hz) for f, r in zip(self._folders, content["cameras"], strict=True)]
         except KeyError as error:
             raise CaptureError(f"{file}: {error} is missing") from None
@@ -111,12 +113,30 @@ class DepthkitFolder:
         except (ValueError, TypeError) as error:
             raise CaptureError(f"{file}: {error}") from None
         self._folder = folder
+        self.start_joints: NDArray[np.floating] | None = None
         self.empty_room: tuple[NDArray[np.uint16] | None, ...] = (None,)
         self.frames = _index([{n: round((n - numbers[0]) * 1e9 / self.frame_rate_hz) for n in numbers}])
 
     def load(self, camera_index: int, number: int) -> tuple[NDArray[np.uint16], NDArray[np.uint8] | None]:
         """See ``recorded_rig.Recording``."""
         return self._folder.load(number)
+
+
+def _start_joints(record: Any) -> NDArray[np.float64] | None:
+    """Joints (16, 3) [m, world] by name.
+
+    Raises:
+        ValueError: a joint is missing, or is not three finite numbers.
+    """
+    if record is None:
+        return None
+    missing = [name for name, _ in NAMED_JOINTS if name not in record]
+    if missing:
+        raise ValueError(f"start_joints: {', '.join(missing)} missing")
+    joints = np.array([record[name] for name, _ in NAMED_JOINTS], np.float64)
+    if joints.shape != (len(NAMED_JOINTS), 3) or not np.isfinite(joints).all():
+        raise ValueError("start_joints: a joint is not three finite numbers")
+    return joints
 
 
 def write_recording(

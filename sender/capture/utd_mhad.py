@@ -23,6 +23,10 @@ _FOCAL_PX, _CX, _CY = 285.63, 160.0, 120.0  # Kinect SDK v1, nominal for 320×24
 _LOOKED_AT = 10  # frames that the camera's height is estimated from
 _MAX_FRAMES = 10_000
 
+_HEAD, _NECK, _SPINE, _HIP_CENTRE = 0, 1, 2, 3
+_LIMBS = [4, 5, 6, 12, 13, 14, 8, 9, 10, 16, 17, 18]  # shoulder, elbow, wrist, hip, knee, ankle; left, right
+_HEAD_SHARE = 0.4  # of the way from the neck to the middle of the head lies the joint of the head
+
 
 class UtdMhadSequence:
     """One sequence; ``path`` is a depth file, or a folder with ``Depth/``, whose first sequence is taken.
@@ -53,6 +57,21 @@ class UtdMhadSequence:
     def load(self, camera_index: int, number: int) -> tuple[NDArray[np.uint16], None]:
         """See ``recorded_rig.Recording``; the data set as kept has no colour."""
         return self._depth[number], None
+
+    @property
+    def start_joints(self) -> NDArray[np.float64] | None:
+        """The sixteen named joints (16, 3) [m, world] of the first frame by the SDK, None without a skeleton file.
+
+        What the SDK calls spine lies lower than our chest, its head in the middle of the head.
+        """
+        try:
+            sdk = self.joints(0)
+        except CaptureError:
+            return None
+        neck, head = sdk[_NECK], sdk[_HEAD]
+        chest = (sdk[_SPINE] + neck) / 2
+        trunk = [sdk[_HIP_CENTRE], chest, neck, neck + _HEAD_SHARE * (head - neck)]
+        return np.array([*trunk, *sdk[_LIMBS]])
 
     def joints(self, number: int) -> NDArray[np.float64]:
         """The SDK's estimate of the 20 joints (20, 3) float64 [m, world] in the order of Skeleton_joint_order.txt.

@@ -95,6 +95,10 @@ class VirtualRig:
     def frame_rate_hz(self) -> float:
         return self._frame_rate_hz
 
+    @property
+    def start_joints(self) -> None:
+        """A rig knows the truth, and does not tell."""
+
     def read(self, timeout_s: float) -> DepthFrame | None:
         """The next frame of any camera in order of capture, or None when none is due in time.
 

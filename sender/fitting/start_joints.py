@@ -23,14 +23,25 @@ from common.geometry import quaternion
 Array = NDArray[Any]
 
 
-def skeleton_from_joints(joints: Array, stature_m: float) -> tuple[Skeleton, SkeletonPose]:
+HEAD_AND_SOLES_M = 0.26  # from the joint of the head to the crown, and from the ankles to the soles
+
+
+def stature_of(joints: Array) -> float:
+    """Stature [m] of the person with these ``joints`` (16, 3) [m], whatever the posture: the bones laid end to end."""
+    at = {name: joints[row] for row, (name, _) in enumerate(NAMED_JOINTS)}
+    bones = [("head", "neck"), ("neck", "chest"), ("chest", "pelvis"), ("left_hip", "left_knee"),
+             ("left_knee", "left_ankle")]  # fmt: skip
+    return HEAD_AND_SOLES_M + float(sum(np.linalg.norm(at[a] - at[b]) for a, b in bones))
+
+
+def skeleton_from_joints(joints: Array, stature_m: float | None = None) -> tuple[Skeleton, SkeletonPose]:
     """Sizes and pose with exactly these ``joints`` (16, 3) [m, world; ``NAMED_JOINTS`` order].
 
     The person faces +Z with the trunk upright; what the joints do not tell (radii, hands, feet, clavicles) is average
     for the stature [m].
     """
     at = {name: joints[row] for row, (name, _) in enumerate(NAMED_JOINTS)}
-    average = human_skeleton(stature_m)
+    average = human_skeleton(stature_of(joints) if stature_m is None else stature_m)
     rotations = _link_rotations(at)
     origins = _link_origins(joints, at, rotations, average)
     parents = np.array(LINK_PARENTS[1:])

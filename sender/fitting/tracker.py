@@ -25,8 +25,10 @@ class FitResult:
 
 
 class Tracker(Protocol):
-    """Follows one person. ``track`` returns None while no person has been found yet (``status`` says why)."""
+    """Follows one person. ``track`` returns None while no person has been found yet (``status`` says why).
+    ``start_from`` begins with sizes and pose known from elsewhere and the cloud they belong to."""
 
     @property
     def status(self) -> str: ...
+    def start_from(self, skeleton: Skeleton, pose: SkeletonPose, cloud: PointCloud, capture_ns: int) -> FitResult: ...
     def track(self, cloud: PointCloud, capture_ns: int) -> FitResult | None: ...
