@@ -205,9 +205,11 @@ class _Stream:
         log.debug("send %s", record)
 
     def _tell_status(self) -> None:
-        if self._tracker.status != self._last_status:
-            self._last_status = self._tracker.status
-            log.info("tracker: %s", self._last_status)
+        status = self._tracker.status
+        what = status.partition(":")[0]  # figures behind the colon change with every frame
+        if what != self._last_status:
+            self._last_status = what
+            log.info("tracker: %s", status)
 
     def _make_metrics(self) -> Metrics:
         metrics = Metrics()
