@@ -11,6 +11,7 @@ import logging
 import secrets
 from collections import Counter, deque
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from typing import Any
 
@@ -21,6 +22,7 @@ from common.runtime.daemon import Daemon, DaemonError
 from common.runtime.metrics import Health, Metrics, daemon_app, serve_app
 from common.runtime.run_statistics import RunStatistics, write_statistics
 from common.runtime.stage_timer import StageTimer
+from common.runtime.threads import into_background
 from common.transport.zenoh_session import ZenohSession, open_session, with_endpoints
 from common.wire.header import WireError
 from common.wire.skeleton_packet import SkeletonPacket
@@ -95,6 +97,7 @@ class _Show:
         self._state = StreamState(clock)
         self._animation_path = AnimationPath(settings.repository, self._timer, clock)
         self._animation = ComputeWorker("animation", self._animation_path.show, self._on_shown, rehearse)
+        self._mesher = ThreadPoolExecutor(1, "mesher", into_background)
         self._messages: asyncio.Queue[bytes] = asyncio.Queue(MESHES_WAITING)
         self._meshes: deque[ReceivedPose] = deque()  # meshed, waiting for the next skeleton; bounded in _mesh_poses
         self._log = ShowLog(settings.shown_log) if settings.shown_log else None
@@ -125,6 +128,7 @@ class _Show:
 
     def close(self) -> None:
         """Write out what is buffered."""
+        self._mesher.shutdown(wait=False, cancel_futures=True)
         if self._log is not None:
             self._log.close()
 
@@ -149,11 +153,12 @@ class _Show:
 
     async def _mesh_poses(self) -> None:
         """Mesh candidate poses, one after the other."""
+        loop = asyncio.get_running_loop()
         while True:
             message = await self._messages.get()
             try:
                 with self._timer.stage("mesh"):
-                    mesh = await asyncio.to_thread(mesh_of, message, self._settings.person)
+                    mesh = await loop.run_in_executor(self._mesher, mesh_of, message, self._settings.person)
             except WireError as error:
                 self._counts["pose refused"] += 1
                 log.warning("a candidate pose is refused: %s", error)

@@ -9,6 +9,7 @@ from pathlib import Path
 from common.runtime.config_file import SettingsError, load_settings
 from common.runtime.daemon import run_daemon, set_up_logging
 from common.runtime.daemon_options import add_daemon_options, overrides
+from common.runtime.threads import prepare_threads
 from sender.config import SenderSettings
 
 EXAMPLES = """examples:
@@ -56,6 +57,7 @@ def main() -> None:
     """Entry point of the console script."""
     options = parse_arguments()
     set_up_logging(options.log_level)
+    prepare_threads()
     try:
         settings = load_settings(SenderSettings, options.config, source_of(overrides(options)))
     except SettingsError as error:

@@ -114,7 +114,9 @@ class _Stream:
         # After a restart somebody waits for the picture: then the first frames load the kernels as they need them.
         rehearsal = rehearse_fitting if body is None else None
         self._fitting = ComputeWorker("fitting", self._fit, self._on_tracked, rehearsal)
-        self._meshing = ComputeWorker("candidates", self._candidates.process, self._on_candidates, rehearse_candidates)
+        self._meshing = ComputeWorker(
+            "candidates", self._candidates.process, self._on_candidates, rehearse_candidates, background=True
+        )
         self._synchronizer = self._make_synchronizer()
         hurried = settings.capture.source != "recording" or settings.capture.realtime
         deliver = self._fitting.submit if hurried else self._fitting.submit_in_turn

@@ -9,6 +9,7 @@ from collections.abc import Callable
 from typing import Generic, TypeVar
 
 from common.runtime.latest_value import Closed, LatestValue
+from common.runtime.threads import into_background
 
 Input = TypeVar("Input")
 Output = TypeVar("Output")
@@ -22,7 +23,8 @@ class ComputeWorker(Generic[Input, Output]):
 
     Its life is the coroutine ``run``: put it into a task group. ``run`` starts the thread, calls ``warm_up`` there
     (compiling kernels, say), and raises what ``job`` or ``warm_up`` raised; cancelling it stops the thread.
-    At most one input waits, and at most one result is on its way to the loop.
+    ``background``: it gives way to whatever else this machine has to do. At most one input
+    waits, and at most one result is on its way to the loop.
     """
 
     def __init__(
@@ -31,11 +33,13 @@ class ComputeWorker(Generic[Input, Output]):
         job: Callable[[Input], Output],
         deliver: Callable[[Output], None],
         warm_up: Callable[[], object] | None = None,
+        background: bool = False,
     ) -> None:
         self._name = name
         self._job = job
         self._deliver = deliver
         self._warm_up = warm_up
+        self._background = background
         self._inputs: LatestValue[Input] = LatestValue()
         self._loop_is_free = threading.Event()
         self._loop_is_free.set()
@@ -80,6 +84,8 @@ class ComputeWorker(Generic[Input, Output]):
     def _work(self, loop: asyncio.AbstractEventLoop, ended: asyncio.Future[BaseException | None]) -> None:
         failure: BaseException | None = None
         try:
+            if self._background:
+                into_background()
             if self._warm_up is not None:
                 self._warm_up()
             loop.call_soon_threadsafe(self._ready.set)

@@ -32,7 +32,7 @@ class HeadlessScreen:
         self._timer = timer
         self._viewer = OffscreenViewer()
         self._rendered: ShownFrame | None = None
-        self._renderer = ComputeWorker("render", self._render, self._on_rendered)
+        self._renderer = ComputeWorker("render", self._render, self._on_rendered, background=True)
 
     def add_pose(self, mesh: RiggedMesh) -> None:
         """Keeps the mesh until it is removed."""
