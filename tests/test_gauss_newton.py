@@ -18,7 +18,7 @@ from sender.fitting.articulated_gauss_newton import PoseState, Schedule, forward
 from sender.fitting.body_fitter import BodyFitter
 from sender.fitting.body_model import BodyModel
 from sender.fitting.gauss_newton_tracker import GaussNewtonSettings, GaussNewtonTracker
-from sender.fitting.joint_limits import joint_table, rotation_exp, rotation_log, swing_twist_angles
+from sender.fitting.joint_limits import joint_table, rotation_exp, rotation_log, swing_twist_angles, turned_on
 from sender.fitting.limb_search import limbs, search_limb
 from tests.capsule_person import SKELETON, capsule_person, pose_at
 
@@ -298,3 +298,15 @@ def test_unseen_limb_loses_its_confidence() -> None:
     assert fit.pose.confidence[LINK_INDEX["left_shin"]] == 0
     assert fit.pose.confidence[LINK_INDEX["left_toes"]] == 0
     assert fit.pose.confidence[LINK_INDEX["upper_spine"]] > 0.8
+
+
+def test_links_turn_on_without_their_twist() -> None:
+    table = joint_table()
+    before, now = np.tile(np.eye(3), (2, LINK_COUNT, 1, 1))
+    link = LINK_INDEX["left_forearm"]  # twists about x
+    now[link] = Rotation.from_rotvec([0.0, 0.2, 0.0]).as_matrix()
+    on = turned_on(before, now, np.array([1.0, 0.0]), table.twist_axis)
+    np.testing.assert_allclose(Rotation.from_matrix(on[0, link]).as_rotvec(), [0.0, 0.4, 0.0], atol=1e-9)
+    np.testing.assert_allclose(on[1], now, atol=1e-9)
+    now[link] = Rotation.from_rotvec([0.3, 0.0, 0.0]).as_matrix()
+    np.testing.assert_allclose(turned_on(before, now, np.array([1.0]), table.twist_axis)[0], now, atol=1e-9)

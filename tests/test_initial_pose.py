@@ -150,6 +150,16 @@ def test_unknown_floor_is_taken_from_the_soles(body: SkinnedBody) -> None:
     assert _errors(_found(lifted, None), truth + lift).mean() < 0.03
 
 
+def test_outline_beyond_the_cloud(body: SkinnedBody) -> None:
+    """Clouds end some 3 cm above the floor; feet and legs must not be lifted by that."""
+    surface, truth = _posed(body, None)
+    cloud = _captured(body, surface, _rig(4))
+    assert cloud.positions[:, 1].min() > surface[:, 1].min() + 0.015
+    found = _found(cloud, None)
+    up = (named_joint_positions(found.skeleton, found.pose) - truth)[:, 1]
+    assert abs(up[[JOINTS.index("left_ankle"), JOINTS.index("right_ankle")]].mean()) < 0.015
+
+
 def test_upper_body_says_that_it_sees_no_legs(body: SkinnedBody) -> None:
     surface, truth = _posed(body, 0.4)
     cloud = _captured(body, surface, _rig(1))

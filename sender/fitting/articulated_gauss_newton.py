@@ -248,8 +248,8 @@ def fit_pose(
     surface: Surface,
     table: JointTable,
     plan: Schedule,
-) -> FitArrays:
-    """Fits the pose to a cloud.
+) -> PoseState:
+    """The pose fitted to a cloud; ``judge_pose`` says how well.
 
     ``points, normals`` (N, 3) float32 [m, world]; ``start``: where iterations begin; ``predicted``: where the motion
     prior pulls; ``offsets`` (L, 3) float64 [m]: joints in their parents' frames. An empty cloud returns the start.
@@ -274,15 +274,15 @@ def fit_pose(
         _solve(A, b)
         _apply(b, root, local, table)
         gate *= shrink
-    return judge_pose(points, normals, PoseState(root, local), offsets, surface, table)
+    return PoseState(root, local)
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
 def judge_pose(
-    points: Array, normals: Array, state: PoseState, offsets: Array, surface: Surface, table: JointTable
+    points: Array, normals: Array, state: PoseState, offsets: Array, surface: Surface, parents: Array
 ) -> FitArrays:
     """How well a pose explains a cloud, without moving it (arguments as in ``fit_pose``)."""
-    R, t = forward(state.root, state.local, offsets, table.parents)
+    R, t = forward(state.root, state.local, offsets, parents)
     count = len(points)
     near = np.empty((count, NEAR_LINKS), np.int8)
     near_links(points, R, t, surface, JUDGED_M, near)

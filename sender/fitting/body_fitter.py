@@ -26,10 +26,14 @@ class BodyFitter:
         self.surface = body.surface(0)
         self.table = table
 
-    def fit(self, cloud: PointCloud, start: PoseState, predicted: PoseState, plan: Schedule) -> FitArrays:
+    def move(self, cloud: PointCloud, start: PoseState, predicted: PoseState, plan: Schedule) -> PoseState:
         """``fit_pose`` of this body."""
         return fit_pose(cloud.positions, cloud.normals, start, predicted, self.offsets, self.surface, self.table, plan)
 
     def judge(self, cloud: PointCloud, state: PoseState) -> FitArrays:
         """``judge_pose`` of this body."""
-        return judge_pose(cloud.positions, cloud.normals, state, self.offsets, self.surface, self.table)
+        return judge_pose(cloud.positions, cloud.normals, state, self.offsets, self.surface, self.table.parents)
+
+    def fit(self, cloud: PointCloud, start: PoseState, predicted: PoseState, plan: Schedule) -> FitArrays:
+        """Moved, then judged on the same points."""
+        return self.judge(cloud, self.move(cloud, start, predicted, plan))

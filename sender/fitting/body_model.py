@@ -25,7 +25,7 @@ FORMAT_VERSION = 1
 MAX_BYTES = 8_000_000
 MAX_POINTS_PER_LINK = 4_000
 CELL_M = 0.012  # one model point per cell and facing
-GRID_CELL_M, GRID_MARGIN_M = 0.015, 0.06
+GRID_CELL_M, GRID_MARGIN_M = 0.020, 0.06
 MEMORY_FRAMES = 90.0  # a cell forgets what is older than about this many observations
 RARE = 0.3  # of the median count of a link's cells: fewer observations are noise
 SEAM_WEIGHT = 0.4  # points a neighbouring link also claims bend with the joint and follow neither link well
@@ -52,16 +52,19 @@ class BodyModel:
         """Surface points of all links."""
         return sum(len(cells.keys) for cells in self._cells)
 
-    def add(self, cloud: PointCloud, T_world_link: Array) -> None:
+    def add(self, cloud: PointCloud, T_world_link: Array, turn: int = 0, turns: int = 1) -> None:
         """Adds a cloud whose pose is ``T_world_link`` (L, 4, 4) [world]; each point goes to the bone it is nearest to,
-        measured in that bone's radii, and near a joint to both bones."""
+        measured in that bone's radii, and near a joint to both bones. Links are taken in ``turns``: only those whose
+        index leaves the remainder ``turn`` get their points."""
         starts, ends = bone_segments(self.skeleton, T_world_link)
         first, second, ratio = nearest_bones(cloud.positions, starts, ends, self.skeleton.radii)
         first, second = _MOVER[first], _MOVER[second]
         seam = (ratio < SEAM_RATIO) & (first != second) & _JOINED[first, second]
-        self.add_assigned(cloud, T_world_link, first, np.where(seam, SEAM_WEIGHT, 1.0))
-        picked = PointCloud(cloud.positions[seam], cloud.normals[seam], cloud.colours[seam])
-        self.add_assigned(picked, T_world_link, second[seam], np.full(int(seam.sum()), SEAM_WEIGHT))
+        rows = np.concatenate([np.arange(len(first)), np.flatnonzero(seam)])
+        links = np.concatenate([first, second[seam]])
+        rows, links = rows[links % turns == turn], links[links % turns == turn]
+        picked = PointCloud(cloud.positions[rows], cloud.normals[rows], cloud.colours[rows])
+        self.add_assigned(picked, T_world_link, links, np.where(seam[rows], SEAM_WEIGHT, 1.0))
 
     def add_assigned(self, cloud: PointCloud, T_world_link: Array, links: Array, weights: Array) -> None:
         """Adds points whose link is known: ``links`` (N,) int, -1 = leave out; ``weights`` (N,) 0..1 rigidity."""
@@ -80,7 +83,7 @@ class BodyModel:
 
     def surface(self, refreshed_links: int = LINK_COUNT) -> Surface:
         """All links' points and closest-point grids. At most ``refreshed_links`` links whose points changed get a new
-        grid (about 15 ms each), the others answer as before; a link's first grid is always built."""
+        grid (2 to 8 ms each), the others answer as before; a link's first grid is always built."""
         missing = [link for link in self._stale if self._grids[link] is None]
         waiting = [link for link in self._stale if self._grids[link] is not None]
         renewed = missing + waiting[: max(refreshed_links - len(missing), 0)]
@@ -166,14 +169,16 @@ class _LinkCells:
 
     def add(self, points: Array, normals: Array, colours: Array, rigid: Array) -> None:
         rows = np.concatenate([points, normals, colours, rigid[:, None], np.ones((len(points), 1))], axis=1)
-        keys, inverse = np.unique(np.concatenate([self.keys, _cell_keys(points, normals)]), return_inverse=True)
-        sums = np.zeros((len(keys), _COLUMNS))
-        _add_rows(inverse, np.concatenate([self.sums, rows]), sums)
-        sums /= np.maximum(sums[:, _COUNT:_COLUMNS] / MEMORY_FRAMES, 1.0)
-        if len(keys) > MAX_POINTS_PER_LINK:  # keep what was seen most often
-            kept = np.sort(np.argsort(-sums[:, _COUNT], kind="stable")[:MAX_POINTS_PER_LINK])
-            keys, sums = keys[kept], sums[kept]
-        self.keys, self.sums = keys, sums
+        keys = _cell_keys(points, normals)
+        hit = np.unique(keys)
+        fresh = hit[~np.isin(hit, self.keys, assume_unique=True)]
+        at = np.searchsorted(self.keys, fresh)
+        self.keys, self.sums = np.insert(self.keys, at, fresh), np.insert(self.sums, at, 0.0, axis=0)
+        _add_rows(np.searchsorted(self.keys, keys), rows, self.sums)
+        self.sums /= np.maximum(self.sums[:, _COUNT:_COLUMNS] / MEMORY_FRAMES, 1.0)
+        if len(self.keys) > MAX_POINTS_PER_LINK:  # keep what was seen most often
+            kept = np.sort(np.argsort(-self.sums[:, _COUNT], kind="stable")[:MAX_POINTS_PER_LINK])
+            self.keys, self.sums = self.keys[kept], self.sums[kept]
 
     def restore(self, sums: Array) -> None:
         points = sums[:, _POSITION] / sums[:, _COUNT:]
@@ -211,7 +216,7 @@ def _join(grids: list[LinkGrid], rigidity: list[Array]) -> Surface:
     low, high = np.ones((LINK_COUNT, 3), np.float32), np.zeros((LINK_COUNT, 3), np.float32)
     for link, grid in enumerate(grids):
         if len(grid.points):
-            low[link], high[link] = grid.points.min(0), grid.points.max(0)
+            low[link], high[link] = grid.low, grid.high
     return Surface(
         points=np.concatenate([grid.points for grid in grids]),
         normals=np.concatenate([grid.normals for grid in grids]),

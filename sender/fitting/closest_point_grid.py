@@ -19,19 +19,21 @@ NORMAL_BINS = 6
 BIN_COSINE = 0.25  # a point is in every bin whose direction is within 75° of its normal
 NEAR_LINKS = 12  # candidate links a point may have
 NORMAL_GATE = 0.35  # least cosine between the normals of a point and its match
-MAX_CELLS = 12_000  # of each main direction: large links get coarser cells, which their flat surfaces allow
+MAX_CELLS = 3_500  # of each main direction: large links get coarser cells, which their flat surfaces allow
 
 
 class LinkGrid(NamedTuple):
     """``points, normals`` (M, 3) float32 [m, link frame]; ``origin`` (3,) float32 [m]: corner of cell (0, 0, 0);
     ``cell_m``: edge; ``nearest`` (6, nx, ny, nz) int16: row of the closest point for a normal of that main direction
-    (+x, -x, +y, -y, +z, -z), -1 where the link has none."""
+    (+x, -x, +y, -y, +z, -z), -1 where the link has none; ``low, high`` (3,) float32: box of the points."""
 
     points: Array
     normals: Array
     origin: Array
     cell_m: float
     nearest: Array
+    low: Array
+    high: Array
 
 
 def build_link_grid(points: Array, normals: Array, cell_m: float, margin_m: float) -> LinkGrid:
@@ -43,14 +45,16 @@ def build_link_grid(points: Array, normals: Array, cell_m: float, margin_m: floa
         raise ValueError(f"closest-point grid: {len(points)} points, at most 32767")
     points, normals = np.ascontiguousarray(points, np.float32), np.ascontiguousarray(normals, np.float32)
     if len(points) == 0:
-        return LinkGrid(points, normals, np.zeros(3, np.float32), cell_m, np.full((NORMAL_BINS, 1, 1, 1), -1, np.int16))
-    origin = (points.min(0) - margin_m).astype(np.float32)
-    extent = points.max(0) + margin_m - origin
+        nothing, zero = np.full((NORMAL_BINS, 1, 1, 1), -1, np.int16), np.zeros(3, np.float32)
+        return LinkGrid(points, normals, zero, cell_m, nothing, zero, zero)
+    low, high = points.min(0), points.max(0)
+    origin = (low - margin_m).astype(np.float32)
+    extent = high + margin_m - origin
     cell_m = max(cell_m, float(np.prod(extent) / MAX_CELLS) ** (1 / 3))
     shape = np.maximum(np.ceil(extent / cell_m).astype(np.int64), 1)
     nearest = np.full((NORMAL_BINS, *shape), -1, np.int16)
     _fill_nearest(points, normals, origin, np.float32(cell_m), nearest)
-    return LinkGrid(points, normals, origin, cell_m, nearest)
+    return LinkGrid(points, normals, origin, cell_m, nearest, low, high)
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
@@ -85,21 +89,26 @@ def _take_from_neighbours(
     points: Array, origin: Array, cell: np.float32, best: Array, distance: Array, x: int, y: int, z: int, step: int
 ) -> None:
     nx, ny, nz = best.shape
-    if 0 <= x + step < nx and best[x + step, y, z] >= 0:
-        _offer(points, origin, cell, best, distance, best[x + step, y, z], x, y, z)
-    if 0 <= y + step < ny and best[x, y + step, z] >= 0:
-        _offer(points, origin, cell, best, distance, best[x, y + step, z], x, y, z)
-    if 0 <= z + step < nz and best[x, y, z + step] >= 0:
-        _offer(points, origin, cell, best, distance, best[x, y, z + step], x, y, z)
+    own = best[x, y, z]
+    first = best[x + step, y, z] if 0 <= x + step < nx else own
+    second = best[x, y + step, z] if 0 <= y + step < ny else own
+    third = best[x, y, z + step] if 0 <= z + step < nz else own
+    if first >= 0 and first != own:
+        _offer(points, origin, cell, best, distance, first, x, y, z)
+    if second >= 0 and second != own and second != first:
+        _offer(points, origin, cell, best, distance, second, x, y, z)
+    if third >= 0 and third != own and third != first and third != second:
+        _offer(points, origin, cell, best, distance, third, x, y, z)
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
 def _offer(
     points: Array, origin: Array, cell: np.float32, best: Array, distance: Array, k: int, x: int, y: int, z: int
 ) -> None:
-    dx = origin[0] + (x + 0.5) * cell - points[k, 0]
-    dy = origin[1] + (y + 0.5) * cell - points[k, 1]
-    dz = origin[2] + (z + 0.5) * cell - points[k, 2]
+    half = np.float32(0.5)
+    dx = origin[0] + (np.float32(x) + half) * cell - points[k, 0]
+    dy = origin[1] + (np.float32(y) + half) * cell - points[k, 1]
+    dz = origin[2] + (np.float32(z) + half) * cell - points[k, 2]
     d = dx * dx + dy * dy + dz * dz
     if d < distance[x, y, z]:
         distance[x, y, z] = d

@@ -20,7 +20,7 @@ from sender.fitting.articulated_gauss_newton import FitArrays, PoseState, Schedu
 from sender.fitting.body_fitter import BodyFitter
 from sender.fitting.body_model import BodyModel
 from sender.fitting.initial_pose import NoPose, find_initial_pose
-from sender.fitting.joint_limits import joint_table
+from sender.fitting.joint_limits import joint_table, turned_on
 from sender.fitting.limb_search import Limb, limbs, search_limb, thinned, within_reach
 from sender.fitting.tracker import FitResult
 from sender.fitting.whole_body_search import WholeBodySearch
@@ -38,7 +38,7 @@ class GaussNewtonSettings:
     for this long before looking again. ``stranger_s``: how long the known person is looked for before anybody else in
     a start pose will do."""
 
-    building_s: float = 1.0
+    building_s: float = 1.5
     good_score: float = 0.095
     lost_score: float = 0.25
     lost_s: float = 1.0
@@ -46,11 +46,11 @@ class GaussNewtonSettings:
 
 
 HYPOTHESES = (1.0, 0.5, 0.0)  # shares of the last velocity
-GUESS = Schedule(3, 0.20, 0.10, 0.2, 1.0, 1.0)
+GUESS = Schedule(1, 0.20, 0.10, 0.2, 1.0, 1.0)
 COARSE = Schedule(2, 0.15, 0.08, 0.1, 1.0, 1.0)
 FINE = Schedule(2, 0.08, 0.06, 0.1, 1.0, 1.0)
-GUESS_POINTS, COARSE_POINTS = 250, 800
-LEARN_EVERY = 3
+GUESS_POINTS, COARSE_POINTS, FINE_POINTS = 250, 600, 1250
+LEARN_TURNS = 3  # a cloud's points are learned for every third link, then for the next third of another cloud
 RETRY_FRAMES = 5  # after a limb search in vain
 SEEN_POINTS = 200  # with fewer explained points no pose is certain
 _FOLLOWS = {"neck": "head"} | {
@@ -152,10 +152,12 @@ class GaussNewtonTracker:
         fits = [fitter.fit(some, start, start, guess) for start in guesses]
         best = min(range(len(fits)), key=lambda k: fits[k].score)
         predicted = guesses[best]
-        fit = fitter.fit(thinned(cloud, COARSE_POINTS), fits[best].pose, predicted, coarse)
-        fit = fitter.fit(cloud, fit.pose, predicted, fine)
-        for limb in self._limbs:
-            fit = self._found_limb(limb, fit, cloud)
+        pose = fitter.move(thinned(cloud, COARSE_POINTS), fits[best].pose, predicted, coarse)
+        pose = fitter.move(thinned(cloud, FINE_POINTS), pose, predicted, fine)
+        fit = fitter.judge(cloud, pose)
+        for limb in self._limbs:  # one search a frame: with two, the frame would come too late
+            if self._is_lost(limb, fit, cloud):
+                return self._found(limb, fit, cloud)
         return fit
 
     def _predicted(self, capture_ns: int) -> list[PoseState]:
@@ -167,9 +169,7 @@ class GaussNewtonTracker:
         if before is None or past_ns <= 0:
             return [now]
         ahead = np.clip((capture_ns - self._times_ns[0]) / past_ns, 0.0, 3.0) * np.array(HYPOTHESES)
-        turn = quaternion.to_rotation_vector(quaternion.from_matrix(np.swapaxes(before.local, 1, 2) @ now.local))
-        turn[np.arange(1, LINK_COUNT), self._table.twist_axis[1:]] = 0.0
-        turns = now.local @ quaternion.to_matrix(quaternion.from_rotation_vector(ahead[:, None, None] * turn))
+        turns = turned_on(before.local, now.local, ahead, self._table.twist_axis)
         roots = now.root + ahead[:, None] * (now.root - before.root)
         return [PoseState(root, local) for root, local in zip(roots, turns, strict=True)]
 
@@ -180,36 +180,40 @@ class GaussNewtonTracker:
         assert self._body is not None
         return self._body
 
-    def _found_limb(self, limb: Limb, fit: FitArrays, cloud: PointCloud) -> FitArrays:
-        """The fit, or a better one when the limb explains much less than usual while points within its reach, which it
-        could explain, are left over."""
+    def _is_lost(self, limb: Limb, fit: FitArrays, cloud: PointCloud) -> bool:
+        """Whether the limb explains much less than usual while points in its reach, which it could explain, are left
+        over."""
         outer = limb.links[1:]
         usual = self._usual[outer].sum() * len(cloud)
         if fit.explained[outer].sum() > 0.4 * usual or self._frames < self._retry_after[outer[0]]:
-            return fit
-        assert self._state is not None
+            return False
         fitter = self._fitter()
         _, joints = forward(fit.pose.root, fit.pose.local, fitter.offsets, self._table.parents)
         left_over = within_reach(limb, joints, fitter.offsets, cloud) & (fit.owner < 0)
-        if left_over.sum() < 0.4 * usual:
-            return fit
+        return bool(left_over.sum() >= 0.4 * usual)
+
+    def _found(self, limb: Limb, fit: FitArrays, cloud: PointCloud) -> FitArrays:
+        """The fit, or a better one with the limb somewhere else."""
+        assert self._state is not None
+        fitter = self._fitter()
         found = search_limb(limb, fit, cloud, fitter, (self._state,))
         if found is fit.pose:
-            self._retry_after[outer[0]] = self._frames + RETRY_FRAMES
+            self._retry_after[limb.links[1]] = self._frames + RETRY_FRAMES
             return fit
         return fitter.fit(cloud, found, found, FINE)
 
     def _accept(self, fit: FitArrays, cloud: PointCloud, capture_ns: int) -> FitResult:
         """Takes the fit as the new state, lets the model learn from it, and says how it went."""
         body = self._known_body()
-        local = quaternion.to_matrix(quaternion.from_matrix(fit.pose.local))  # rounding must not add up over frames
+        rotations = quaternion.from_matrix(fit.pose.local)
+        local = quaternion.to_matrix(rotations)  # rounding must not add up over frames
         if capture_ns > self._times_ns[0]:
             self._before, self._times_ns = self._state, (capture_ns, self._times_ns[0])
         self._state = PoseState(fit.pose.root, local)
         share = fit.explained / max(len(cloud), 1)
         self._usual = np.where(share > self._usual, share, self._usual + 0.02 * (share - self._usual))
         confidence = self._link_confidence(fit, len(cloud))
-        pose = SkeletonPose(fit.pose.root, quaternion.from_matrix(local), confidence)
+        pose = SkeletonPose(fit.pose.root, rotations, confidence)
         self._learn(fit, pose, cloud, capture_ns)
         lost = self._settings.lost_score
         sure = np.clip((lost - fit.score) / lost * 1.25, 0.0, 1.0) * min(fit.explained.sum() / SEEN_POINTS, 1.0)
@@ -225,15 +229,19 @@ class GaussNewtonTracker:
         return self._result
 
     def _learn(self, fit: FitArrays, pose: SkeletonPose, cloud: PointCloud, capture_ns: int) -> None:
-        """Adds every third good cloud while building; grids follow one link a frame, so that no frame waits long."""
+        """While building, every other frame adds a good cloud's points to a third of the links; the frames between
+        renew one link's grid, so that no frame waits long."""
         body = self._known_body()
         self._status = "tracking" if self._building_until_ns is None else "tracking, learning the surface"
+        renew = self._frames % 2 == 1
         if self._building_until_ns is not None:
-            if fit.score < self._settings.good_score and self._frames % LEARN_EVERY == 0:
-                body.add(cloud, forward_kinematics(body.skeleton, pose))
+            if fit.score < self._settings.good_score and not renew:
+                turn = self._frames // 2 % LEARN_TURNS
+                body.add(cloud, forward_kinematics(body.skeleton, pose), turn, LEARN_TURNS)
             if capture_ns >= self._building_until_ns:
                 self._building_until_ns = None
-        body.surface(1)
+        if renew:
+            body.surface(1)
 
     def _link_confidence(self, fit: FitArrays, count: int) -> Array:
         seen = fit.explained / np.maximum(fit.assigned, 1.0)

@@ -34,6 +34,7 @@ FINE_FITS = 4
 INLIER_M = 0.035
 LEAST_INLIERS = 0.6
 POINTS_OF_A_SEEN_LINK = 8.0
+EDGE_M = 0.03  # a cloud ends inside the outline: no normals at its edge, grazing surfaces are lost, points are averaged
 ON_FLOOR_M = 0.3  # a cloud that ends higher above the floor shows no feet
 LEAST_STATURE_M = 1.1  # where the floor is not known, what is lower is taken for an upper body
 AVERAGE_STATURE_M = 1.70
@@ -95,7 +96,7 @@ def find_initial_pose(cloud: PointCloud, floor_y: float | None = None) -> Initia
 
 def _outline(points: Floats, normals: Floats, floor_y: float | None) -> _Outline | NoPose:
     heights = np.sort(points[:, 1])
-    top, bottom = float(heights[-3]), float(heights[2])
+    top, bottom = float(heights[-3]) + EDGE_M, float(heights[2]) - EDGE_M
     if not 0.3 < top - bottom < 2.4:
         return NoPose(f"the cloud is {top - bottom:.2f} m high: not one person")
     mean_normal = normals[:, [0, 2]].mean(axis=0)  # cancels when cameras stand all around
@@ -152,7 +153,8 @@ def _starts(template: Template, outline: _Outline) -> list[TemplateFit]:
 
 
 def _best_fit(template: Template, points: Floats, normals: Floats, outline: _Outline) -> TemplateFit:
-    """Coarse fits from all starts, then fine ones of the two cheapest; the cheapest of those."""
+    """Coarse fits from all starts, then fine ones of the cheapest of each facing: few points do not tell front from
+    back. The cheapest of those."""
     used = np.ones(len(template.cone_links), np.bool_) if outline.whole_body else ~template.leg_cones
     floor_y = outline.floor_y if outline.whole_body else None
 
@@ -161,11 +163,15 @@ def _best_fit(template: Template, points: Floats, normals: Floats, outline: _Out
     ) -> list[TemplateFit]:
         rows = np.arange(min(count, len(points))) * len(points) // min(count, len(points))
         few, few_normals = points[rows], normals[rows]
-        found = [fit_template(template, few, few_normals, fit, used, floor_y, iterations, gates_m) for fit in fits]
+        found = [
+            fit_template(template, few, few_normals, fit, used, floor_y, iterations, gates_m, EDGE_M) for fit in fits
+        ]
         return sorted(found, key=lambda fit: fit.cost)
 
     coarse = refined(_starts(template, outline), COARSE_POINTS, COARSE_ITERATIONS, COARSE_GATES_M)
-    return refined(coarse[:FINE_FITS], FINE_POINTS, FINE_ITERATIONS, FINE_GATES_M)[0]
+    share = FINE_FITS // len(outline.headings)
+    kept = [fit for heading in outline.headings for fit in [fit for fit in coarse if fit.heading == heading][:share]]
+    return refined(kept, FINE_POINTS, FINE_ITERATIONS, FINE_GATES_M)[0]
 
 
 def _judged(template: Template, fit: TemplateFit, outline: _Outline, cloud_points: int) -> InitialPose | NoPose:

@@ -219,3 +219,27 @@ def swing_twist_angles(M: Array, axis: int, v: Array) -> None:
     f = 2.0 * np.arctan2(s, n) / s if s > 1e-9 else 2.0
     v[axis] = 2.0 * np.arctan2(cx, cw)
     v[i], v[j] = f * si, f * sj
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def turned_on(before: Array, now: Array, shares: Array, twist_axis: Array) -> Array:
+    """Local rotations (K, L, 3, 3) when every link goes on turning by each of ``shares`` (K,) of its turn from
+    ``before`` to ``now`` (L, 3, 3) about its parent, without the twist; the root keeps all three axes."""
+    out = np.empty((len(shares), *now.shape))
+    M, v = np.empty((3, 3)), np.empty(3)
+    for link in range(len(now)):
+        for k in range(len(shares)):
+            _multiply(before[link].T, now[link], M)
+            rotation_log(M, v)
+            if link > 0:
+                v[twist_axis[link]] = 0.0
+            rotation_exp(v * shares[k], M)
+            _multiply(now[link], M, out[k, link])
+    return out
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _multiply(P: Array, Q: Array, out: Array) -> None:
+    for i in range(3):
+        for j in range(3):
+            out[i, j] = P[i, 0] * Q[0, j] + P[i, 1] * Q[1, j] + P[i, 2] * Q[2, j]

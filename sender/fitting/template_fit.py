@@ -48,18 +48,20 @@ def fit_template(
     floor_y: float | None,
     iterations: int,
     gates_m: tuple[float, float],
+    edge_m: float = 0.0,
 ) -> TemplateFit:
     """Fit sizes and angles to ``points``, ``normals`` (N, 3) [m, world] from ``start``, with its priors.
 
     ``used`` (K,): cones of parts the cloud can show; ``floor_y`` [m]: height of the floor under the feet, None when
-    they are not seen; ``gates_m``: scale of the robust kernel in the first and the last iteration.
+    they are not seen; ``gates_m``: scale of the robust kernel in the first and the last iteration; ``edge_m``:
+    how far inside the body's outline the outermost points lie.
     """
     K, P, N = len(template.cone_links), len(start.theta), len(points)
     ends, radii = np.empty((K, 2, 3)), np.empty((K, 2))
     d_ends, d_radii = np.empty((P, K, 2, 3)), np.empty((P, K, 2))
     cone, along, distance, outward = np.empty(N, np.int64), np.empty(N), np.zeros(N), np.empty((N, 3))
     tables, root = tuple(template[:10]), len(template.prior) - 3 - len(template.angle_links)
-    precision = 1.0 / template.sigma**2
+    precision, tips = 1.0 / template.sigma**2, template.tip_cones[used[template.tip_cones]]
     theta, prior, heading = start.theta.copy(), start.prior, start.heading
     total, scale_m = float(N), gates_m[1]
     point_sigma_m = _POINT_SIGMA_M * np.sqrt(max(N, 1) / _EFFECTIVE_POINTS)
@@ -71,7 +73,7 @@ def fit_template(
         total = add_points(cone, along, distance, outward, d_ends, d_radii, scale_m, point_sigma_m, H, g)
         if iteration == iterations:
             break
-        add_extents(points, ends, radii, d_ends, d_radii, template.tip_cones[used[template.tip_cones]], 0.01, H, g)
+        add_extents(points, ends, radii, d_ends, d_radii, tips, edge_m, 0.01, H, g)
         if floor_y is not None:
             add_floor(floor_y, ends, radii, d_ends, d_radii, template.sole_cones, 0.01, H, g)
         H = H + np.tril(H, -1).T

@@ -159,11 +159,11 @@ def add_points(cone, along, distance, outward, d_ends, d_radii, scale_m, sigma_m
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
-def add_extents(points, ends, radii, d_ends, d_radii, tips, sigma_m, H, g):  # type: ignore[no-untyped-def]
+def add_extents(points, ends, radii, d_ends, d_radii, tips, edge_m, sigma_m, H, g):  # type: ignore[no-untyped-def]
     """Rows for the body's ends: how far points reach past the end of cone ``tips[j]``, along its axis.
 
     Points beyond the middle of the cone and within a hand's breadth of its axis count; the third farthest is the
-    extent, so that two stray points do not stretch a limb.
+    extent, so that two stray points do not stretch a limb. ``edge_m``: how much farther the body itself reaches.
     """
     P = len(g)
     row = np.empty(P)
@@ -187,7 +187,7 @@ def add_extents(points, ends, radii, d_ends, d_radii, tips, sigma_m, H, g):  # t
                 third = s
         if third < 0.0:
             continue
-        d = third - length - radii[k, 1]
+        d = third + edge_m - length - radii[k, 1]
         for p in range(P):
             row[p] = -d_radii[p, k, 1] - ax * d_ends[p, k, 1, 0] - ay * d_ends[p, k, 1, 1] - az * d_ends[p, k, 1, 2]
         _add_row(row, d, 1.0 / (sigma_m * sigma_m), H, g)
