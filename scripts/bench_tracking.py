@@ -19,16 +19,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from common.body.skeleton import LINK_COUNT, LINK_INDEX, LINK_PARENTS, NAMED_JOINT_LINKS, NAMED_JOINTS, SIDES, Skeleton
-from common.body.skeleton import human_skeleton as average_skeleton
-from common.body.skeleton_pose import SkeletonPose, forward_kinematics
-from common.geometry import quaternion
+from common.body.skeleton import NAMED_JOINT_LINKS
+from common.body.skeleton_pose import forward_kinematics
 from common.geometry.point_cloud import PointCloud
 from sender.capture.frame_set import DepthFrame
 from sender.capture.performer import Performer, open_performer
 from sender.capture.rig_layout import RigSettings
 from sender.capture.rig_process import RigRenderer
 from sender.fitting.gauss_newton_tracker import GaussNewtonSettings, GaussNewtonTracker
+from sender.fitting.start_joints import skeleton_from_joints
 from sender.fitting.tracker import FitResult
 from sender.reconstruction.background import BackgroundModel, BackgroundSettings
 from sender.reconstruction.foreground_points import PointSampler
@@ -195,52 +194,3 @@ def surface_points(
     points = a[chosen] * s + b[chosen] * (t - s) + c[chosen] * (1 - t)
     unit = normals[chosen] / np.maximum(areas[chosen, None], 1e-12)
     return PointCloud(points.astype(np.float32), unit.astype(np.float32), colours[faces[chosen, 0]])
-
-
-def skeleton_from_joints(joints: Array, stature_m: float) -> tuple[Skeleton, SkeletonPose]:
-    """Sizes and pose with exactly these ``joints`` (16, 3) [m, world; NAMED_JOINTS order], facing +Z, trunk upright;
-    what the joints do not tell (radii, hands, feet, clavicles) is average for the stature."""
-    at = {name: joints[row] for row, (name, _) in enumerate(NAMED_JOINTS)}
-    average = average_skeleton(stature_m)
-    rotations = np.tile(np.eye(3), (LINK_COUNT, 1, 1))
-    origins = np.full((LINK_COUNT, 3), np.nan)
-    origins[NAMED_JOINT_LINKS] = joints
-    origins[LINK_INDEX["lower_spine"]] = (at["pelvis"] + at["chest"]) / 2
-    for side, sign in zip(SIDES, (1.0, -1.0), strict=True):
-        shoulder, elbow, wrist, hip, knee, ankle = (
-            at[f"{side}_{joint}"] for joint in ("shoulder", "elbow", "wrist", "hip", "knee", "ankle")
-        )
-        upper = _axes(sign * (elbow - shoulder), wrist - elbow)  # bent about y: the forearm lies in the x-z plane
-        fore = _axes(sign * (wrist - elbow), np.cross(wrist - elbow, upper[:, 1]) * sign)
-        rotations[LINK_INDEX[f"{side}_upper_arm"]] = upper
-        for part in ("forearm", "hand", "fingers"):
-            rotations[LINK_INDEX[f"{side}_{part}"]] = fore
-        for part, bone in (("thigh", knee - hip), ("shin", ankle - knee)):
-            down = np.array([0.0, -1.0, 0.0])
-            rotations[LINK_INDEX[f"{side}_{part}"]] = quaternion.to_matrix(quaternion.shortest_arc(down, bone))
-        origins[LINK_INDEX[f"{side}_clavicle"]] = at["neck"] + (shoulder - at["neck"]) * (0.15, 0.8, 0.5)
-    for row, parent in enumerate(LINK_PARENTS):
-        if not np.isnan(origins[row, 0]):
-            continue
-        origins[row] = origins[parent] + rotations[parent] @ average.offsets[row]
-    parents = np.array(LINK_PARENTS[1:])
-    offsets = np.zeros((LINK_COUNT, 3))
-    offsets[1:] = np.einsum("lji,lj->li", rotations[parents], origins[1:] - origins[parents])
-    tips = average.tips.copy()
-    for row, parent in enumerate(LINK_PARENTS):
-        if parent > 0 and parent != LINK_INDEX["upper_spine"]:
-            tips[parent] = offsets[row]
-    tips[LINK_INDEX["pelvis"]] = offsets[LINK_INDEX["lower_spine"]]
-    tips[LINK_INDEX["upper_spine"]] = offsets[LINK_INDEX["neck"]]
-    local = rotations.copy()
-    local[1:] = np.swapaxes(rotations[parents], 1, 2) @ rotations[1:]
-    pose = SkeletonPose(origins[0], quaternion.from_matrix(local), np.ones(LINK_COUNT, np.float32))
-    return Skeleton(offsets.astype(np.float32), tips, average.radii), pose
-
-
-def _axes(x: Array, near_z: Array) -> Array:
-    """Right-handed axes (3, 3) as columns: the first along ``x``, the third as near ``near_z`` as it can be."""
-    x = x / np.linalg.norm(x)
-    z = near_z - x * (x @ near_z)
-    z = z / np.linalg.norm(z)
-    return np.stack([x, np.cross(z, x), z], axis=1)

@@ -27,12 +27,13 @@ from sender.capture.synchronizer import Synchronizer
 from sender.capture.virtual_rig import VirtualRig
 from sender.channels_out import SenderChannels
 from sender.config import SenderSettings
+from sender.fitting.body_model import BodyModel
 from sender.fitting.gauss_newton_tracker import GaussNewtonSettings, GaussNewtonTracker
 from sender.pipeline import CandidatePath, Candidates, SkeletonPath, StreamIdentity, TrackedFrame
 from sender.receiver_links import ReceiverLinks
 from sender.reconstruction.background import BackgroundModel
 from sender.reconstruction.foreground_points import PointSampler
-from sender.rehearsal import rehearse_candidates, rehearse_fitting
+from sender.rehearsal import rehearse_all, rehearse_candidates
 
 log = logging.getLogger(__name__)
 
@@ -57,18 +58,32 @@ class SenderDaemon:
         """
         settings = self._settings
         store = BodyStore(settings.state_folder, settings.site, settings.person)
+        body = store.load()
         async with open_session(with_endpoints(settings.link, "sender")) as session:
             try:
-                source = await asyncio.to_thread(open_source, settings.capture)
+                source = await self._open_source(body)
                 try:
-                    await self._run_with(source, session, store, daemon)
+                    await self._run_with(source, session, store, body, daemon)
                 finally:
                     await asyncio.to_thread(source.close)
             except CaptureError as error:
                 raise DaemonError(str(error)) from error
 
-    async def _run_with(self, source: FrameSource, session: ZenohSession, store: BodyStore, daemon: Daemon) -> None:
-        stream = _Stream(self._settings, source, session, store, self._clock, self._health)
+    async def _open_source(self, body: BodyModel | None) -> FrameSource:
+        """Open the cameras, and rehearse meanwhile: the first frames are worth as much as any.
+
+        After a restart somebody waits for the picture; then the first frames load the kernels as they need them.
+        """
+        rehearsal = rehearse_all if body is None else rehearse_candidates
+        rehearsing = asyncio.create_task(asyncio.to_thread(rehearsal))
+        source = await asyncio.to_thread(open_source, self._settings.capture)
+        await rehearsing
+        return source
+
+    async def _run_with(
+        self, source: FrameSource, session: ZenohSession, store: BodyStore, body: BodyModel | None, daemon: Daemon
+    ) -> None:
+        stream = _Stream(self._settings, source, session, store, body, self._clock, self._health)
         app = daemon_app(stream.metrics, self._health)
         http = self._settings.http
         try:
@@ -91,6 +106,7 @@ class _Stream:
         source: FrameSource,
         session: ZenohSession,
         store: BodyStore,
+        body: BodyModel | None,
         clock: MonotonicClock,
         health: Health,
     ) -> None:
@@ -102,7 +118,6 @@ class _Stream:
         self._timer = StageTimer(clock)
         self._statistics = RunStatistics(self._timer)
         identity = StreamIdentity(settings.person, secrets.randbits(32))
-        body = store.load()
         self._tracker = GaussNewtonTracker(GaussNewtonSettings(), body)
         self._skeletons = self._skeleton_path(identity)
         self._candidates = CandidatePath(identity, settings.poses, self._timer)
@@ -111,12 +126,8 @@ class _Stream:
         self._links = ReceiverLinks(
             identity.epoch, self._scheduler, self._channels.bulk_publisher, self._on_sent, clock
         )
-        # After a restart somebody waits for the picture: then the first frames load the kernels as they need them.
-        rehearsal = rehearse_fitting if body is None else None
-        self._fitting = ComputeWorker("fitting", self._fit, self._on_tracked, rehearsal)
-        self._meshing = ComputeWorker(
-            "candidates", self._candidates.process, self._on_candidates, rehearse_candidates, background=True
-        )
+        self._fitting = ComputeWorker("fitting", self._fit, self._on_tracked)
+        self._meshing = ComputeWorker("candidates", self._candidates.process, self._on_candidates, background=True)
         self._synchronizer = self._make_synchronizer()
         hurried = settings.capture.source != "recording" or settings.capture.realtime
         deliver = self._fitting.submit if hurried else self._fitting.submit_in_turn

@@ -63,6 +63,12 @@ def rehearse_candidates() -> None:
         candidates.process(tracked)
 
 
+def rehearse_all() -> None:
+    """What a sender does from the first frame on."""
+    rehearse_fitting()
+    rehearse_candidates()
+
+
 def _view(camera: Camera) -> View:
     depth = mannequin_depth(camera)
     return View(camera, 0, 0, depth, np.full((*depth.shape, 3), 128, np.uint8))

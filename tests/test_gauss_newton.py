@@ -12,7 +12,7 @@ from common.body.skeleton import LINK_COUNT, LINK_INDEX, NAMED_JOINT_LINKS
 from common.body.skeleton_pose import SkeletonPose, forward_kinematics, joint_positions, named_joint_positions
 from common.geometry import quaternion
 from common.geometry.point_cloud import PointCloud
-from scripts.bench_tracking import skeleton_from_joints, surface_points, surface_radius
+from scripts.bench_tracking import surface_points, surface_radius
 from sender.capture.performer import Performer, open_performer
 from sender.fitting.articulated_gauss_newton import PoseState, Schedule, forward
 from sender.fitting.body_fitter import BodyFitter
@@ -20,6 +20,7 @@ from sender.fitting.body_model import BodyModel
 from sender.fitting.gauss_newton_tracker import GaussNewtonSettings, GaussNewtonTracker
 from sender.fitting.joint_limits import joint_table, rotation_exp, rotation_log, swing_twist_angles, turned_on
 from sender.fitting.limb_search import limbs, search_limb
+from sender.fitting.start_joints import skeleton_from_joints
 from tests.capsule_person import SKELETON, capsule_person, pose_at
 
 TABLE = joint_table()
