@@ -86,7 +86,7 @@ def start_daemons(options: argparse.Namespace, run: Path) -> dict[str, subproces
     send = [str(BIN / "telepose-send"), "-l", link, "--http-port", "0", "--state", str(run)]
     send += ["--stats", str(run / "sender.json"), "--ready-file", str(run / "sender.ready")]
     if options.recording:
-        send += ["--recording", str(options.recording)]
+        send += ["--recording", str(options.recording), *([] if options.headless else ["--loop"])]
     else:
         send += ["--body", options.body, "--cameras", str(options.cameras)]
     send += ["--motion", options.motion] if options.motion else []

@@ -31,7 +31,8 @@ NOTHING = PointCloud(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.float32),
 
 def capsule_cloud(pose: SkeletonPose, count: int = 2000, seed: int = 0) -> PointCloud:
     mesh = capsule_person(0, pose).mesh
-    return surface_points(mesh.vertices, mesh.faces, mesh.colours, count, np.random.default_rng(seed))
+    colours = np.zeros((len(mesh.vertices), 3), np.uint8)
+    return surface_points(mesh.vertices, mesh.faces, colours, count, np.random.default_rng(seed))
 
 
 def state_of(pose: SkeletonPose) -> PoseState:

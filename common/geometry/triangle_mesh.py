@@ -23,10 +23,3 @@ class TriangleMesh:
     def surface(self) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
         """What ``rasterizer.render`` paints."""
         return self.uv, self.texture
-
-    @property
-    def colours(self) -> NDArray[np.uint8]:
-        """Colour (V, 3) uint8 of the texture's pixel at each vertex."""
-        size = np.array(self.texture.shape[1::-1])
-        column, row = np.clip((self.uv * size).astype(int), 0, size - 1).T
-        return self.texture[row, column]
