@@ -144,5 +144,6 @@ def stop(daemons: dict[str, subprocess.Popen[bytes]]) -> dict[str, int]:
 
 
 if __name__ == "__main__":
-    signal.signal(signal.SIGTERM, lambda *_: signal.raise_signal(signal.SIGINT))
+    for stop_signal in (signal.SIGINT, signal.SIGTERM):  # a shell starts what it puts behind with SIGINT ignored
+        signal.signal(stop_signal, signal.default_int_handler)
     sys.exit(main())
