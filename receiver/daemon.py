@@ -18,6 +18,7 @@ from typing import Any
 from common.body.skeleton import Skeleton
 from common.runtime.clock import MonotonicClock
 from common.runtime.compute_worker import ComputeWorker
+from common.runtime.config_file import dump_settings
 from common.runtime.daemon import Daemon, DaemonError
 from common.runtime.metrics import Health, Metrics, daemon_app, serve_app
 from common.runtime.run_statistics import RunStatistics, write_statistics
@@ -273,6 +274,7 @@ class _Show:
         """Everything worth keeping of the run."""
         rendered = self.viewer.frames_rendered if isinstance(self.viewer, HeadlessScreen) else None
         return self._statistics.figures() | {
+            "settings": dump_settings(self._settings),
             "skeletons_received": self._channels.skeletons.counts["accepted"],
             "frames_shown": self._state.frames_shown,
             "frames_rendered": self._state.frames_shown if rendered is None else rendered,

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from common.body.skeleton import NAMED_JOINT_LINKS
 from common.body.skeleton_pose import forward_kinematics
 from common.geometry.point_cloud import PointCloud
+from scripts.fidelity import bounding_ball_radius
 from sender.capture.frame_set import DepthFrame
 from sender.capture.performer import Performer, open_performer
 from sender.capture.rig_layout import RigSettings
@@ -147,7 +148,7 @@ def _points_given(performer: Performer, length_s: float) -> Run:
             fit: FitResult | None = tracker.start_from(skeleton, pose, cloud, 0)
         else:
             fit = tracker.track(cloud, round(time_s * 1e9))
-        result.add(fit, time.thread_time() - begun, joints, surface_radius(surface), time_s)
+        result.add(fit, time.thread_time() - begun, joints, bounding_ball_radius(surface), time_s)
     return result
 
 
@@ -172,14 +173,8 @@ def _depth_auto(performer: Performer, length_s: float) -> Run:
         begun = time.thread_time()
         fit = tracker.track(cloud, round(time_s * 1e9))
         cpu_s = time.thread_time() - begun
-        result.add(fit, cpu_s, performer.named_joints(time_s), surface_radius(performer.surface(time_s)), time_s)
+        result.add(fit, cpu_s, performer.named_joints(time_s), bounding_ball_radius(performer.surface(time_s)), time_s)
     return result
-
-
-def surface_radius(vertices: Array) -> float:
-    """Radius [m] of the ball about the middle of the box of ``vertices`` (V, 3) that holds them all."""
-    middle = (vertices.min(axis=0) + vertices.max(axis=0)) / 2
-    return float(np.linalg.norm(vertices - middle, axis=1).max())
 
 
 def surface_points(

@@ -55,10 +55,6 @@ class BodyStore:
         except OSError as error:
             log.warning("body file %s was not written: %s", self._path, error.strerror)
 
-    def forget(self) -> None:
-        """Remove the body kept: another person has come."""
-        self._path.unlink(missing_ok=True)
-
 
 def _user_state_folder() -> Path:
     base = (

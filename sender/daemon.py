@@ -13,6 +13,7 @@ from typing import Any
 
 from common.runtime.clock import MonotonicClock
 from common.runtime.compute_worker import ComputeWorker
+from common.runtime.config_file import dump_settings
 from common.runtime.daemon import Daemon, DaemonError
 from common.runtime.metrics import Health, Metrics, daemon_app, serve_app
 from common.runtime.run_statistics import RunStatistics, write_statistics
@@ -256,6 +257,7 @@ class _Stream:
         rig = self._source if isinstance(self._source, VirtualRig) else None
         rig_elapsed_s = (self._clock.now_ns() - rig.epoch_ns) / 1e9 if rig else 0.0
         return self._statistics.figures() | {
+            "settings": dump_settings(self._settings),
             "frames_captured": self._capture.sets,
             "camera_frames": self._capture.frames,
             "skeletons_published": self._published,

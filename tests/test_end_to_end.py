@@ -36,6 +36,7 @@ def test_a_person_gets_through_and_both_ends_leave_cleanly(here):
         assert code == 0, daemon.log
         assert seconds < 2.5
     assert here.figures("sender")["skeleton_bytes_max"] <= 250
+    assert 'site = "studio"' in here.figures("receiver")["settings"]
     kinds = {kind for kind, _, _ in read_show_log(log)}
     assert kinds == {"skeleton", "body", "pose", "frame", "tick"}
 
@@ -49,6 +50,7 @@ def test_a_killed_receiver_comes_back_to_the_picture(here):
     second = here.receiver(name="again")
     second.wait_for(POSES, 1)  # handed what the sender has, body included
     second.wait_for(SHOWN, 10)
+    assert second.get("/readyz") == (200, "ok\n")
 
 
 def test_a_killed_sender_goes_on_in_mid_motion(here):

@@ -12,7 +12,8 @@ from common.body.skeleton import LINK_COUNT, LINK_INDEX, NAMED_JOINT_LINKS
 from common.body.skeleton_pose import SkeletonPose, forward_kinematics, joint_positions, named_joint_positions
 from common.geometry import quaternion
 from common.geometry.point_cloud import PointCloud
-from scripts.bench_tracking import surface_points, surface_radius
+from scripts.bench_tracking import surface_points
+from scripts.fidelity import bounding_ball_radius
 from sender.capture.performer import Performer, open_performer
 from sender.fitting.articulated_gauss_newton import PoseState, Schedule, forward
 from sender.fitting.body_fitter import BodyFitter
@@ -192,7 +193,7 @@ def error_at(frame: int, tracker: GaussNewtonTracker, capture_ns: int) -> float:
     assert fit is not None
     joints = performer().named_joints(frame / 30)
     away = np.linalg.norm(named_joint_positions(fit.skeleton, fit.pose) - joints, axis=1).mean()
-    return float(away / surface_radius(performer().surface(frame / 30)))
+    return float(away / bounding_ball_radius(performer().surface(frame / 30)))
 
 
 def started() -> GaussNewtonTracker:

@@ -77,10 +77,6 @@ class BodyModel:
             if int(link) not in self._stale:
                 self._stale.append(int(link))
 
-    def rescaled(self, skeleton: Skeleton) -> None:
-        """Takes new sizes; the surface stays where it is in the links' frames."""
-        self.skeleton = skeleton
-
     def surface(self, refreshed_links: int = LINK_COUNT) -> Surface:
         """All links' points and closest-point grids. At most ``refreshed_links`` links whose points changed get a new
         grid (2 to 8 ms each), the others answer as before; a link's first grid is always built."""
