@@ -86,6 +86,11 @@ class ReceiverChannels:
         self._session.declare_presence(self._key(channels.RECEIVER_PRESENCE, self._name))
         self._session.watch_presence(self._key(channels.SENDER_PRESENCE), lambda _, present: handlers.presence(present))
 
+    def close(self) -> None:
+        """Hear nothing more: what still arrives while the session closes has nobody to go to."""
+        for subscriber in self.subscribers.values():
+            subscriber.close()
+
     def send_report(self, repository_poses: int) -> None:
         """Tell the sender's bulk window how things are."""
         newest = self.skeletons.newest

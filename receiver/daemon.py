@@ -128,7 +128,8 @@ class _Show:
             daemon.announce_ready()
 
     def close(self) -> None:
-        """Write out what is buffered."""
+        """Hear nothing more, and write out what is buffered."""
+        self._channels.close()
         self._mesher.shutdown(wait=False, cancel_futures=True)
         if self._log is not None:
             self._log.close()

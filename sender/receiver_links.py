@@ -67,14 +67,20 @@ class ReceiverLinks:
 
     async def run(self) -> None:
         """Serve all links until cancelled; raises what one of them raised."""
-        async with asyncio.TaskGroup() as group:
-            self._group = group
-            while True:
-                await asyncio.sleep(LOOK_EVERY_S)
-                now_ns = self._clock.now_ns()
-                for link in self.links:
-                    if now_ns - link.heard_ns > GONE_AFTER_NS:
-                        self._close(link, "no reports any more")
+        try:
+            async with asyncio.TaskGroup() as group:
+                self._group = group
+                while True:
+                    await asyncio.sleep(LOOK_EVERY_S)
+                    self._close_silent()
+        finally:
+            self._group = None  # reports go on while the session closes, and open nothing
+
+    def _close_silent(self) -> None:
+        now_ns = self._clock.now_ns()
+        for link in self.links:
+            if now_ns - link.heard_ns > GONE_AFTER_NS:
+                self._close(link, "no reports any more")
 
     def wake(self) -> None:
         """The scheduler has something new."""

@@ -163,6 +163,16 @@ async def test_junk_on_every_channel_is_counted():
         assert [both.heard[kind] for kind in ("skeleton", "body", "pose")] == [[], [], []]
 
 
+async def test_after_closing_nothing_is_handed_on():
+    async with ends() as both:
+        both.sender.publish_body(body())
+        await until(lambda: both.heard["body"])
+        both.receiver.close()
+        both.sender.publish_skeleton(packet(0))
+        await asyncio.sleep(0.1)
+        assert both.heard["skeleton"] == []
+
+
 async def test_another_persons_packets_under_our_key_are_refused():
     async with ends() as both:
         foreign = SkeletonPacket(3, EPOCH, 0, CLOCK.now_ns(), 1, 1.0, rest_pose())

@@ -128,6 +128,14 @@ async def test_names_cannot_be_claimed_without_end():
         assert bench.links.counts["refused"] == 2 * RECEIVERS_MAX
 
 
+async def test_a_report_after_the_end_opens_nothing():
+    async with running() as bench:
+        pass
+    bench.report("late")
+    assert bench.links.links == ()
+    assert bench.links.counts["refused"] == 1
+
+
 async def test_a_malformed_report_opens_nothing():
     async with running() as bench:
         with pytest.raises(WireError):
