@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 
 from common.runtime.config_file import SettingsError, load_settings
-from common.runtime.daemon import run_daemon, set_up_logging
+from common.runtime.daemon import leave, run_daemon, set_up_logging
 from common.runtime.daemon_options import add_daemon_options, overrides
 from common.runtime.threads import prepare_threads
 from sender.config import SenderSettings
@@ -64,4 +64,4 @@ def main() -> None:
         sys.exit(f"telepose-send: {error}")
     from sender.daemon import SenderDaemon  # numba and OpenCV take a second: not for --help or a wrong setting
 
-    sys.exit(run_daemon("telepose-send", SenderDaemon(settings).run, options.ready_file))
+    leave(run_daemon("telepose-send", SenderDaemon(settings).run, options.ready_file))

@@ -92,7 +92,7 @@ def run_daemon(
             continue
         if stopping:
             log.warning("%s: second %s, leaving at once", name, signal.Signals(number).name)
-            _leave(128 + number)
+            leave(128 + number)
         stopping = True
         _leave_at_deadline(name, stop_within_s)
         supervisor.stop(signal.Signals(number).name)
@@ -211,20 +211,20 @@ def _log_failure(name: str, error: BaseException) -> None:
 def _leave_at_deadline(name: str, within_s: float) -> None:
     """End the process after ``within_s``, unless it has ended by then."""
 
-    def leave() -> None:
+    def give_up() -> None:
         log.error("%s: not stopped within %s s, leaving", name, within_s)
         faulthandler.dump_traceback()
-        _leave(1)
+        leave(1)
 
-    timer = threading.Timer(within_s, leave)
+    timer = threading.Timer(within_s, give_up)
     timer.daemon = True
     timer.start()
     # Should C code hold the interpreter's lock, no Python thread runs any more; this one is none.
     faulthandler.dump_traceback_later(within_s + 0.1, exit=True)
 
 
-def _leave(exit_code: int) -> None:
-    """End the process now: no destructors, no waiting for threads."""
+def leave(exit_code: int) -> None:
+    """End the process now: no destructors, no waiting for threads that may be anywhere in compiled code."""
     logging.shutdown()
     os._exit(exit_code)
 
