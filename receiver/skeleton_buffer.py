@@ -13,6 +13,7 @@ from common.wire.skeleton_packet import SkeletonPacket
 RETIRED_EPOCHS = 16
 CLOCK_SLACK_NS = 2_000_000_000
 FASTEST_RATE_HZ = 240
+FUTURE_RUN = 10  # so many packets from the future, each fit to follow the one before: then it is the newest that is odd
 
 
 class SkeletonBuffer:
@@ -22,11 +23,16 @@ class SkeletonBuffer:
         self.newest: SkeletonPacket | None = None
         self.counts: Counter[str] = Counter()
         self._arrival_ns = 0
+        self._ahead: SkeletonPacket | None = None  # the last one refused as from the future
+        self._ahead_ns = 0
+        self._ahead_run = 0
         self._retired: deque[int] = deque(maxlen=RETIRED_EPOCHS)
 
     def push(self, packet: SkeletonPacket, now_ns: int) -> bool:
         """Take a packet that arrived at ``now_ns`` (receiver's monotonic clock); True when it is the one to show."""
         verdict = self._judge(packet, now_ns)
+        if verdict == "far_future" and self._is_the_present(packet, now_ns):
+            verdict = "accepted"
         self.counts[verdict] += 1
         if verdict != "accepted":
             return False
@@ -37,7 +43,16 @@ class SkeletonBuffer:
         else:
             self.counts["lost"] += packet.sequence - self.newest.sequence - 1
         self.newest, self._arrival_ns = packet, now_ns
+        self._ahead, self._ahead_run = None, 0
         return True
+
+    def _is_the_present(self, packet: SkeletonPacket, now_ns: int) -> bool:
+        """Whether the packets refused as from the future have become the stream: a first packet that was held up for
+        seconds (a cold start, a jam on the link) must not make all later ones look too early for ever."""
+        follows = self._ahead is not None and _follows(self._ahead, packet, now_ns - self._ahead_ns)
+        self._ahead, self._ahead_ns = packet, now_ns
+        self._ahead_run = self._ahead_run + 1 if follows else 1
+        return self._ahead_run >= FUTURE_RUN
 
     def _judge(self, packet: SkeletonPacket, now_ns: int) -> str:
         newest = self.newest
@@ -50,9 +65,12 @@ class SkeletonBuffer:
         if packet.sequence < newest.sequence or packet.capture_ns <= newest.capture_ns:
             return "stale"
         # A forged or broken packet from the future would make every honest one after it stale.
-        advance_ns = packet.capture_ns - newest.capture_ns
-        if advance_ns > now_ns - self._arrival_ns + CLOCK_SLACK_NS:
-            return "far_future"
-        if packet.sequence - newest.sequence > FASTEST_RATE_HZ * (advance_ns / 1e9 + 1):
-            return "far_future"
-        return "accepted"
+        return "accepted" if _follows(newest, packet, now_ns - self._arrival_ns) else "far_future"
+
+
+def _follows(before: SkeletonPacket, packet: SkeletonPacket, passed_ns: int) -> bool:
+    """Whether capture time and sequence went on from ``before`` as they can in the time between the arrivals."""
+    advance_ns = packet.capture_ns - before.capture_ns
+    frames = packet.sequence - before.sequence
+    in_time = 0 < advance_ns <= passed_ns + CLOCK_SLACK_NS
+    return packet.epoch == before.epoch and in_time and 0 < frames <= FASTEST_RATE_HZ * (advance_ns / 1e9 + 1)

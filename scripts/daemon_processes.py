@@ -30,9 +30,12 @@ def free_port() -> int:
 class Running:
     """One process and the HTTP port of its daemon; ``log`` is its standard error."""
 
-    def __init__(self, name: str, command: list[str], folder: Path, http_port: int | None = None) -> None:
+    def __init__(
+        self, name: str, command: list[str], folder: Path, http_port: int | None, together: list[Running]
+    ) -> None:
         self.name = name
         self.http_port = http_port
+        self._together = together  # all processes of the site: when one waits in vain, another may be why
         self._log = folder / f"{name}.log"
         environment = os.environ | {"PYTHONSAFEPATH": "1"}
         with self._log.open("ab") as log:
@@ -66,9 +69,25 @@ class Running:
         begin = time.monotonic()
         while self.metric(name) < least:
             assert self.process.poll() is None, f"{self.name} ended with {self.process.returncode}:\n{self.log}"
-            assert time.monotonic() - begin < limit_s, f"{self.name}: {name} < {least} after {limit_s} s:\n{self.log}"
+            if time.monotonic() - begin > limit_s:
+                states = "\n".join(running.state() for running in self._together)
+                raise AssertionError(f"{self.name}: {name} < {least} after {limit_s} s\n{states}")
             time.sleep(0.02)
         return time.monotonic() - begin
+
+    def state(self) -> str:
+        """What is known of the process when something went wrong: exit code, log with every thread's stack, metrics.
+
+        A process that still runs is ended by this (SIGABRT: Python writes the stacks).
+        """
+        metrics = "" if self.http_port is None else self.get("/metrics")[1]
+        alive = self.process.poll() is None
+        if alive:
+            self.process.send_signal(signal.SIGABRT)
+            self.process.wait(10)
+        how = "was running" if alive else f"ended with {self.process.returncode}"
+        figures = "\n".join(line for line in metrics.splitlines() if not line.startswith("#"))
+        return f"--- {self.name} {how}\n{self.log}\n{figures}"
 
     def end(self, number: signal.Signals = signal.SIGTERM, limit_s: float = 10.0) -> tuple[int, float]:
         """Send a signal; exit code and seconds until the end."""
@@ -118,7 +137,7 @@ class Site:
         return figures
 
     def _start(self, name: str, command: list[str], port: int | None = None) -> Running:
-        started = Running(name, command, self.folder, port)
+        started = Running(name, command, self.folder, port, self.running)
         self.running.append(started)
         return started
 

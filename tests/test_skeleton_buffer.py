@@ -4,7 +4,7 @@ import pytest
 
 from common.body.skeleton_pose import rest_pose
 from common.wire.skeleton_packet import SkeletonPacket
-from receiver.skeleton_buffer import RETIRED_EPOCHS, SkeletonBuffer
+from receiver.skeleton_buffer import FUTURE_RUN, RETIRED_EPOCHS, SkeletonBuffer
 
 FRAME_NS = 33_333_333
 
@@ -67,6 +67,23 @@ def test_a_packet_from_the_future_does_not_silence_the_honest_ones(forged):
     assert not buffer.push(forged, 3 * FRAME_NS)
     assert buffer.counts["far_future"] == 1
     assert buffer.push(packet(3), 3 * FRAME_NS)
+
+
+def test_a_first_packet_held_up_for_seconds_does_not_silence_the_stream():
+    buffer = SkeletonBuffer()
+    late_ns = 5_000_000_000  # its fit compiled kernels, say; those after it are on time
+    assert buffer.push(packet(1), FRAME_NS + late_ns)
+    arrivals = [FRAME_NS + late_ns + k * FRAME_NS for k in range(1, 100)]
+    taken = [buffer.push(packet(1 + k, capture_ns=t), t) for k, t in enumerate(arrivals, 1)]
+    assert taken.index(True) == FUTURE_RUN - 1
+    assert all(taken[FUTURE_RUN:])
+
+
+def test_a_run_of_unrelated_packets_from_the_future_is_refused():
+    buffer = fed(1, 2)
+    for k in range(10 * FUTURE_RUN):
+        assert not buffer.push(packet(3, capture_ns=10**18 - k), 3 * FRAME_NS + k)
+    assert buffer.push(packet(3), 4 * FRAME_NS)
 
 
 def test_a_long_outage_is_not_mistaken_for_the_future():

@@ -78,6 +78,7 @@ def run_daemon(
     except DaemonError as error:
         log.error("%s failed: %s", name, error)
         return 1
+    faulthandler.enable()  # a crash, or SIGABRT to a daemon that hangs, shows where every thread is
     # The interpreter writes the number of each signal to this socket, whichever thread receives it.
     inbox, outbox = socket.socketpair()
     outbox.setblocking(False)
