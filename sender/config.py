@@ -46,8 +46,9 @@ class CaptureSettings:
 
 @dataclass(frozen=True, slots=True)
 class TrackingSettings:
-    """``points``: how many points of each frame's cloud the tracker is given."""
+    """``tracker``: by name. ``points``: how many points of each frame's cloud it is given."""
 
+    tracker: Literal["gauss-newton"] = "gauss-newton"
     points: int = 2500
 
     def __post_init__(self) -> None:

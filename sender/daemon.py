@@ -29,7 +29,7 @@ from sender.capture.virtual_rig import VirtualRig
 from sender.channels_out import SenderChannels
 from sender.config import SenderSettings
 from sender.fitting.body_model import BodyModel
-from sender.fitting.gauss_newton_tracker import GaussNewtonSettings, GaussNewtonTracker
+from sender.fitting.open_tracker import open_tracker
 from sender.pipeline import CandidatePath, Candidates, SkeletonPath, StreamIdentity, TrackedFrame
 from sender.receiver_links import ReceiverLinks
 from sender.reconstruction.background import BackgroundModel
@@ -119,7 +119,7 @@ class _Stream:
         self._timer = StageTimer(clock)
         self._statistics = RunStatistics(self._timer)
         identity = StreamIdentity(settings.person, secrets.randbits(32))
-        self._tracker = GaussNewtonTracker(GaussNewtonSettings(), body)
+        self._tracker = open_tracker(settings.tracking.tracker, body)
         self._skeletons = self._skeleton_path(identity)
         self._candidates = CandidatePath(identity, settings.poses, self._timer)
         self._scheduler = MeshScheduler()

@@ -8,6 +8,7 @@ from typing import Protocol
 from common.body.skeleton import Skeleton
 from common.body.skeleton_pose import SkeletonPose
 from common.geometry.point_cloud import PointCloud
+from sender.fitting.body_model import BodyModel
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -26,9 +27,12 @@ class FitResult:
 
 class Tracker(Protocol):
     """Follows one person. ``track`` returns None while no person has been found yet (``status`` says why).
-    ``start_from`` begins with sizes and pose known from elsewhere and the cloud they belong to."""
+    ``start_from`` begins with sizes and pose known from elsewhere and the cloud they belong to. ``body``: the person's
+    surface as learned so far, for a tracker that learns one: worth saving for a restart."""
 
     @property
     def status(self) -> str: ...
+    @property
+    def body(self) -> BodyModel | None: ...
     def start_from(self, skeleton: Skeleton, pose: SkeletonPose, cloud: PointCloud, capture_ns: int) -> FitResult: ...
     def track(self, cloud: PointCloud, capture_ns: int) -> FitResult | None: ...
