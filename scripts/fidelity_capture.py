@@ -1,0 +1,120 @@
+"""What the cameras of a virtual rig saw of a performance, frame by frame, with both skeletons: the true and our own.
+
+Captured once and played to every method and bandwidth alike. Long sessions repeat the motion; its first two seconds
+(start pose and blend) are played once.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from common.body.skeleton import Skeleton
+from common.body.skeleton_pose import SkeletonPose
+from common.body.view import View
+from common.geometry.rasterizer import render
+from scripts.fidelity import Picture, measuring_cameras
+from scripts.true_skeleton import TrueSkeleton
+from sender.capture.frame_set import DepthFrame
+from sender.capture.performer import Performer, open_performer
+from sender.capture.rig_layout import RigSettings
+from sender.capture.rig_process import RigRenderer
+from sender.fitting.open_tracker import open_tracker
+from sender.reconstruction.background import BackgroundModel, BackgroundSettings
+from sender.reconstruction.foreground_points import PointSampler
+
+FRAME_RATE_HZ = 30
+FRAME_NS = round(1e9 / FRAME_RATE_HZ)
+START_S = 2.0  # start pose and blend
+POINTS = 2500
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CapturedFrame:
+    """One instant. ``time_s`` of the performance; ``views`` of the cameras that see the person; skeleton, pose and
+    confidence from the truth and from our tracker (``own`` is None before its start)."""
+
+    time_s: float
+    views: tuple[View, ...]
+    true: tuple[Skeleton, SkeletonPose]
+    own: tuple[Skeleton, SkeletonPose, float] | None
+
+
+class Capture:
+    """A performance in memory; ``frame(k)`` is the k-th frame of a session of any length."""
+
+    def __init__(self, performer: Performer, frames: list[CapturedFrame]) -> None:
+        self.performer = performer
+        self._frames = frames
+        self._truth: dict[int, list[Picture]] = {}
+
+    def index(self, k: int) -> int:
+        """Which captured frame is the k-th of a session."""
+        once, all_frames = int(START_S * FRAME_RATE_HZ), len(self._frames)
+        return k if k < all_frames else once + (k - all_frames) % (all_frames - once)
+
+    def frame(self, k: int) -> CapturedFrame:
+        """The k-th frame of a session."""
+        return self._frames[self.index(k)]
+
+    def truth(self, k: int) -> list[Picture]:
+        """The true person at frame k in the six measuring views; kept."""
+        index = self.index(k)
+        if index not in self._truth:
+            surface = self.performer.surface(self._frames[index].time_s)
+            look = self.performer.mesh
+            colours = look.vertex_colours if look.uv is None or look.texture is None else (look.uv, look.texture)
+            cameras = measuring_cameras(surface)
+            self._truth[index] = [render(surface, look.faces, colours, camera) for camera in cameras]
+        return self._truth[index]
+
+
+def capture(
+    body: str,
+    motion: str | None,
+    data: Path | None,
+    cameras: int,
+    seconds: float,
+    progress: Callable[[float], None] | None = None,
+) -> Capture:
+    """Render, cut out and track ``seconds`` of a performance (at most until it repeats).
+
+    Raises:
+        CaptureError: no such body or motion.
+    """
+    performer = open_performer(body, motion, data)
+    truth = TrueSkeleton(performer)
+    renderer = RigRenderer(performer, RigSettings(cameras=cameras))
+    rooms = [
+        BackgroundModel(camera, renderer.empty_room(index), BackgroundSettings())
+        for index, camera in enumerate(renderer.cameras)
+    ]
+    sampler = PointSampler(renderer.cameras, POINTS)
+    tracker = open_tracker("gauss-newton")
+    frames = []
+    count = int(min(seconds, performer.duration_s + START_S) * FRAME_RATE_HZ)
+    for k in range(count):
+        time_s = k / FRAME_RATE_HZ
+        views = []
+        for index, camera in enumerate(renderer.cameras):
+            depth = np.empty((camera.height, camera.width), np.uint16)
+            colour = np.empty((camera.height, camera.width, 3), np.uint8)
+            renderer.view(index, time_s, depth, colour)
+            view = rooms[index].foreground(DepthFrame(index, k, k * FRAME_NS, depth, colour))
+            if view is not None:
+                views.append(View(view.camera, view.u0, view.v0, view.depth_mm.copy(), view.colour.copy()))
+        fit = tracker.track(sampler.points(views), k * FRAME_NS)
+        own = None if fit is None else (fit.skeleton, fit.pose, fit.confidence)
+        frames.append(CapturedFrame(time_s, tuple(views), (truth.skeleton, truth.pose(time_s)), own))
+        if k % FRAME_RATE_HZ == 0 and progress is not None:
+            progress(k / count)
+    return Capture(performer, frames)
+
+
+def show_progress(what: str) -> Callable[[float], None]:
+    """Progress on stderr, one line that is written over."""
+    return lambda share: print(f"\r{what} {share:4.0%}", end="", file=sys.stderr, flush=True)

@@ -1,0 +1,225 @@
+"""Ways to show a distant person over a thin link, all fed the same frames: DISPOSE and what it claims to beat."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from common.body.rigged_mesh import RiggedMesh
+from common.body.skeleton import LINK_COUNT, Skeleton
+from common.body.skeleton_pose import SkeletonPose, forward_kinematics
+from common.body.skinning import animate_rigid, link_motion
+from common.geometry.camera_model import Camera
+from common.geometry.rasterizer import render
+from common.runtime.stage_timer import StageTimer
+from common.wire.candidate_pose import CandidatePose, encode_candidate_pose
+from common.wire.skeleton_packet import SkeletonPacket
+from receiver.config import RepositorySettings
+from receiver.pipeline import AnimationPath, ReceivedPose, SkeletonToShow, mesh_of
+from scripts.fidelity import Picture
+from scripts.fidelity_capture import FRAME_NS, FRAME_RATE_HZ, CapturedFrame
+from scripts.fidelity_link import ByteLink
+from sender.candidate_poses.mesh_scheduler import MeshScheduler
+from sender.candidate_poses.usable_pose_set import UsablePoseSet
+
+CANDIDATE_EVERY = 6  # frames: 200 ms, as in the sender
+LEAST_CONFIDENCE = 0.5
+DEPTH_STEP_MM, JPEG_QUALITY = 2, 85
+
+
+class Method(Protocol):
+    """``frame``: the k-th frame is captured, and as much as the link carries in a frame's time arrives. ``picture``:
+    what is then on screen. ``shown_k``: the frame whose posture that is; None: nobody."""
+
+    link: ByteLink
+
+    def frame(self, k: int, captured: CapturedFrame) -> None: ...
+    def picture(self, cameras: list[Camera]) -> list[Picture] | None: ...
+    @property
+    def shown_k(self) -> int | None: ...
+    @property
+    def switches(self) -> int: ...
+
+
+def posed(captured: CapturedFrame, own: bool) -> tuple[Skeleton, SkeletonPose, float] | None:
+    """Skeleton, pose and confidence a method is given."""
+    return captured.own if own else (*captured.true, 1.0)
+
+
+def encoded_candidate(pose_id: int, k: int, captured: CapturedFrame, own: bool) -> bytes | None:
+    """The candidate pose of a frame, or None when its skeleton is doubtful or nobody is seen."""
+    fitted = posed(captured, own)
+    if fitted is None or fitted[2] < LEAST_CONFIDENCE or not captured.views:
+        return None
+    candidate = CandidatePose(pose_id, 0, 1, k * FRAME_NS, fitted[0], fitted[1], captured.views)
+    return encode_candidate_pose(candidate, JPEG_QUALITY, DEPTH_STEP_MM)
+
+
+class _NoClock:
+    def now_ns(self) -> int:
+        return 0
+
+
+class _Animated:
+    """Shared by the methods that animate a captured mesh: which mesh, and the links it is moved to."""
+
+    def __init__(self, rate_bps: float, own: bool) -> None:
+        self.link = ByteLink(rate_bps, FRAME_RATE_HZ, skeletons=True)
+        self.own = own
+        self.shown_k: int | None = None
+        self.switches = 0
+        self._poses = 0
+        self._shown: tuple[RiggedMesh, NDArray[np.float32]] | None = None
+
+    def _show(self, k: int, mesh: RiggedMesh, motion: NDArray[np.float32]) -> None:
+        self.switches += self._shown is not None and self._shown[0] is not mesh
+        self._shown, self.shown_k = (mesh, motion), k
+
+    def picture(self, cameras: list[Camera]) -> list[Picture] | None:
+        """The mesh moved, seen by the cameras."""
+        if self._shown is None:
+            return None
+        mesh, motion = self._shown
+        vertices = animate_rigid(mesh, motion)
+        return [render(vertices, mesh.faces_drawn, mesh.mesh.surface, camera) for camera in cameras]
+
+
+class Dispose(_Animated):
+    """Both pipelines whole: usable pose set, χ, scheduler; repository, selection by σ."""
+
+    def __init__(self, rate_bps: float, own: bool, settings: RepositorySettings | None = None) -> None:
+        super().__init__(rate_bps, own)
+        self._usable = UsablePoseSet()
+        self._scheduler = MeshScheduler()
+        self._scheduler.receiver_joined("receiver", 1)
+        clock = _NoClock()
+        self._animation = AnimationPath(settings or RepositorySettings(), StageTimer(clock), clock)
+        self._arrived: list[ReceivedPose] = []
+        self._meshes: dict[int, RiggedMesh] = {}
+
+    def frame(self, k: int, captured: CapturedFrame) -> None:
+        """Offer a candidate now and then, carry bytes, select and animate."""
+        fitted = posed(captured, self.own)
+        self.link.start_frame()
+        if fitted is not None:
+            self._usable.add_skeleton(k * FRAME_NS, forward_kinematics(fitted[0], fitted[1]))
+        if k % CANDIDATE_EVERY == 0:
+            self._offer(k, captured)
+        self._carry(k)
+        if fitted is not None:
+            self._animate(k, fitted)
+
+    def _offer(self, k: int, captured: CapturedFrame) -> None:
+        encoded = encoded_candidate(self._poses + 1, k, captured, self.own)
+        if encoded is None:
+            return
+        self._poses += 1
+        self._usable.add_pose(mesh_of(encoded, 0).mesh)
+        chi = self._usable.quotients()
+        self._scheduler.offer(self._poses, encoded, k * FRAME_NS, chi.get(self._poses, 0.0))
+        self._scheduler.update(chi, self._usable.retained())
+
+    def _carry(self, k: int) -> None:
+        while True:
+            if self.link.idle:
+                budget_bytes = int(self.link.bytes_per_frame * FRAME_RATE_HZ)
+                chosen = self._scheduler.next_for("receiver", budget_bytes, k * FRAME_NS)
+                if chosen is None:
+                    return
+                record = self._scheduler.sent("receiver", chosen[0], k * FRAME_NS)
+                if record is not None:
+                    self._usable.sent(record.pose_id, record.retain_threshold)
+                self.link.send(chosen[1], len(chosen[1]))
+            message = self.link.arrived()
+            if message is None:
+                return
+            assert isinstance(message, bytes)
+            self._arrived.append(mesh_of(message, 0))
+
+    def _animate(self, k: int, fitted: tuple[Skeleton, SkeletonPose, float]) -> None:
+        from collections import deque
+
+        skeleton, pose, confidence = fitted
+        packet = SkeletonPacket(0, 1, k, k * FRAME_NS, 1, confidence, pose, None)
+        shown = self._animation.show(SkeletonToShow(packet, skeleton, deque(self._arrived)))
+        self._arrived.clear()
+        self._meshes |= {mesh.pose_id: mesh for mesh in shown.added}
+        if shown.frame is not None and shown.frame.pose_id is not None and shown.frame.motion is not None:
+            self._show(k, self._meshes[shown.frame.pose_id], shown.frame.motion)
+        for pose_id in shown.removed:
+            self._meshes.pop(pose_id, None)
+
+
+class LastMesh(_Animated):
+    """Raghuraman et al. 2013: the newest mesh that has arrived, moved by the newest skeleton."""
+
+    def __init__(self, rate_bps: float, own: bool) -> None:
+        super().__init__(rate_bps, own)
+        self._mesh: RiggedMesh | None = None
+
+    def frame(self, k: int, captured: CapturedFrame) -> None:
+        """Whenever the link is free, the newest frame's mesh goes out."""
+        self.link.start_frame()
+        while True:
+            if self.link.idle:
+                encoded = encoded_candidate(self._poses + 1, k, captured, self.own)
+                if encoded is None:
+                    break
+                self._poses += 1
+                self.link.send(encoded, len(encoded))
+            message = self.link.arrived()
+            if message is None:
+                break
+            assert isinstance(message, bytes)
+            self._mesh = mesh_of(message, 0).mesh
+        fitted = posed(captured, self.own)
+        if self._mesh is not None and fitted is not None:
+            self._show(k, self._mesh, link_motion(self._mesh, forward_kinematics(fitted[0], fitted[1])))
+
+
+class FirstMesh(LastMesh):
+    """The first mesh for ever: what all selection must beat."""
+
+    def frame(self, k: int, captured: CapturedFrame) -> None:
+        """As ``LastMesh`` until something has arrived."""
+        if self._mesh is None:
+            super().frame(k, captured)
+            return
+        fitted = posed(captured, self.own)
+        if fitted is not None:
+            self._show(k, self._mesh, link_motion(self._mesh, forward_kinematics(fitted[0], fitted[1])))
+
+
+class Ceiling(_Animated):
+    """The newest capture, no limit: what the cameras and the mesher can do at best."""
+
+    def __init__(self, rate_bps: float, own: bool) -> None:
+        super().__init__(rate_bps, own)
+        self._newest: tuple[int, CapturedFrame] | None = None
+
+    def frame(self, k: int, captured: CapturedFrame) -> None:
+        """Remembered; meshed only when looked at."""
+        self._newest, self.shown_k = (k, captured), k
+
+    def picture(self, cameras: list[Camera]) -> list[Picture] | None:
+        """The newest frame's own mesh, where it was captured."""
+        assert self._newest is not None
+        encoded = encoded_candidate(1, *self._newest, self.own)
+        if encoded is None:
+            return None
+        mesh = mesh_of(encoded, 0).mesh
+        still = np.tile(np.eye(3, 4, dtype=np.float32), (LINK_COUNT, 1, 1))
+        self._shown = (mesh, still)
+        return super().picture(cameras)
+
+
+METHODS: dict[str, Callable[[float, bool], Method]] = {
+    "dispose": Dispose,
+    "dispose-exhaustive": lambda rate, own: Dispose(rate, own, RepositorySettings(search="exhaustive", hold=False)),
+    "last-mesh": LastMesh,
+    "first-mesh": FirstMesh,
+    "ceiling": Ceiling,
+}
