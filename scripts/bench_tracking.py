@@ -1,191 +1,194 @@
-"""How well the pose tracker follows: e_t of 16 joints (Lien 2009 §6.2.1) on every body and clip there is.
+"""How well each tracker follows: e_t of 16 joints (Lien 2009 §6.2.1) by body, clip and condition.
 
-Conditions: ``points-given``, as in the paper: 2,500 points of the true surface, first pose and sizes from the truth;
-``depth4-auto``: four virtual depth cameras with their noise, reconstruction, automatic start, nothing given.
-e_t = mean distance of the joints ÷ R, R = radius of the ball about the middle of the true surface's box, per frame.
-``aligned``: after one constant offset per joint in its link's estimated frame, fitted over the run.
+Cases are ``tracker/body/clip/condition``; ``tracking_conditions`` says what a condition is, ``tracking_run`` what the
+figures are. At the end come, for every tracker and condition, the means over the clean clips and over those whose truth
+has flips (joints turning faster than people can, found in the truth itself).
 """
 
 from __future__ import annotations
 
+import argparse
 import json
+import multiprocessing
 import sys
-import time
-from collections.abc import Iterator
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Iterator
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import ExitStack
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from common.body.skeleton import NAMED_JOINT_LINKS
-from common.body.skeleton_pose import forward_kinematics
-from common.geometry.point_cloud import PointCloud
-from scripts.fidelity import bounding_ball_radius
-from sender.capture.frame_set import DepthFrame
-from sender.capture.performer import Performer, open_performer
-from sender.capture.rig_layout import RigSettings
-from sender.capture.rig_process import RigRenderer
-from sender.fitting.gauss_newton_tracker import GaussNewtonSettings, GaussNewtonTracker
-from sender.fitting.start_joints import skeleton_from_joints
-from sender.fitting.tracker import FitResult
-from sender.reconstruction.background import BackgroundModel, BackgroundSettings
-from sender.reconstruction.foreground_points import PointSampler
+from scripts.run_bench import Row
+from scripts.tracking_conditions import condition, performer_for, sights
+from scripts.tracking_run import flips_of, follow, is_clean
+from sender.fitting.open_tracker import TRACKERS, open_tracker
 
-Array = NDArray[Any]
-
-FRAME_RATE_HZ = 30
-POINTS = 2500
-CAMERAS = 4
-LOST_E_T = 0.1
-CONDITIONS = ("points-given", "depth4-auto")
+DEFAULT_CONDITIONS = (
+    "points-given,points-auto,depth4-auto,depth2-auto,depth1-auto,"
+    "15fps-given,noise1cm-given,noise3cm-given,share5-given,share2-given"
+)
+ROUTINE = "routine"  # the built-in performer's motion
+WARM_UP_S = 0.3
+_UNITS = {"time_to_skeleton_s": "s", "ms_per_frame_p50": "ms", "ms_per_frame_p99": "ms", "lost_share": "1"}
 _REFERENCES = {
-    "e_t_mean": (0.01, "Lien 2009 Fig. 6 (dance clip, points and first pose given)"),
-    "e_t_max": (0.02, "Lien 2009 Fig. 6 (dance clip, points and first pose given)"),
-    "ms_per_frame_p50": (1000 / 61.3, "Lien 2009 §6.2.1 (61.3 fps at best, 2,500 of 10,000 points)"),
+    "e_t_mean": (0.01, "Lien 2009 Fig. 6, dance clip"),
+    "e_t_max": (0.02, "Lien 2009 Fig. 6, dance clip"),
+    "ms_per_frame_p50": (1000 / 61.3, "Lien 2009 §6.2.1: 61.3 fps at best"),
 }
 
 
-@dataclass
-class Run:
-    """One tracked run. ``errors`` (F, 16) in R, ``offsets`` (F, 16, 3): true minus estimated in link frames, in R."""
+@dataclass(frozen=True, slots=True)
+class Case:
+    """One film and the tracker that follows it."""
 
-    errors: list[Array] = field(default_factory=list)
-    offsets: list[Array] = field(default_factory=list)
-    missing: int = 0
-    cpu_ms: list[float] = field(default_factory=list)
-    time_to_skeleton_s: float | None = None
+    tracker: str
+    body: str
+    clip: str
+    condition: str
+    data: Path | None
+    seconds: float | None
 
-    def add(self, fit: FitResult | None, cpu_s: float, joints: Array, radius_m: float, time_s: float) -> None:
-        self.cpu_ms.append(cpu_s * 1e3)
-        if fit is None:
-            self.missing += 1
-            return
-        if self.time_to_skeleton_s is None:
-            self.time_to_skeleton_s = time_s
-        T = forward_kinematics(fit.skeleton, fit.pose)[NAMED_JOINT_LINKS].astype(np.float64)
-        away = joints - T[:, :3, 3]
-        self.errors.append(np.linalg.norm(away, axis=1) / radius_m)
-        self.offsets.append(np.einsum("jba,jb->ja", T[:, :3, :3], away) / radius_m)
-
-    def metrics(self) -> dict[str, tuple[float | None, str]]:
-        """Name → (value, unit); e_t over the frames with a skeleton, the others count as lost."""
-        if not self.errors:
-            return {"lost_share": (1.0, "1")}
-        e_t = np.array(self.errors).mean(axis=1)
-        offsets = np.array(self.offsets)
-        aligned = np.linalg.norm(offsets - offsets.mean(axis=0), axis=2)
-        lost = (self.missing + int((e_t > LOST_E_T).sum())) / (self.missing + len(e_t))
-        return {
-            "e_t_mean": (float(e_t.mean()), "R"),
-            "e_t_mean_aligned": (float(aligned.mean()), "R"),
-            "e_t_max": (float(e_t.max()), "R"),
-            "lost_share": (lost, "1"),
-            "time_to_skeleton_s": (self.time_to_skeleton_s, "s"),
-            "ms_per_frame_p50": (float(np.percentile(self.cpu_ms, 50)), "ms (CPU of the thread)"),
-            "ms_per_frame_p99": (float(np.percentile(self.cpu_ms, 99)), "ms (CPU of the thread)"),
-        }
+    @property
+    def name(self) -> str:
+        return f"{self.tracker}/{self.body}/{self.clip}/{self.condition}"
 
 
-def run(data: Path | None, seconds: float | None = None, clips: list[str] | None = None) -> list[dict[str, Any]]:
-    """Rows for every body and clip of ``data`` and for the built-in performer; progress on stderr.
+@dataclass(frozen=True, slots=True, eq=False)
+class Result:
+    """A case's figures, ``flipped`` of ``frames`` in its truth, and the error over time for pictures."""
 
-    ``seconds``: at most this much of each clip (default: all of it, once). ``clips``: only these (``routine`` is the
-    built-in one).
+    case: Case
+    metrics: dict[str, float]
+    flipped: int
+    frames: int
+    times_s: list[float]
+    e_t: list[float]
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """This bench's own options."""
+    parser.add_argument("--trackers", default="gauss-newton", help=f"of {', '.join(TRACKERS)}, separated by commas")
+    parser.add_argument("--conditions", default=DEFAULT_CONDITIONS, help="separated by commas")
+    parser.add_argument("--bodies", default="", help="only these, separated by commas")
+    parser.add_argument("--jobs", type=int, default=1, help="cases at a time, each in a process; times are noisy then")
+
+
+def run(
+    data: Path | None, seconds: float | None, clips: tuple[str, ...], trackers: str, conditions: str, bodies: str,
+    jobs: int,
+) -> Iterator[Row]:  # fmt: skip
+    """Rows of every case as it is done, then the means; progress on stderr."""
+    cases = list(_cases(data, seconds, clips, _names(trackers), _names(conditions), _names(bodies)))
+    results = []
+    with ExitStack() as stack:
+        for result in _measured(cases, jobs, stack):
+            results.append(result)
+            print(f"{len(results)}/{len(cases)} {_summary(result)}", file=sys.stderr, flush=True)
+            yield from _rows(result, jobs)
+    yield from means(results)
+
+
+def means(results: Iterable[Result]) -> Iterator[Row]:
+    """Rows for every tracker and condition over the clean clips and over the others: means, but of maxima the largest.
+
+    A case without any skeleton counts in ``lost_share``, it has no e_t.
     """
-    _warm_up()
-    rows = []
-    for body, motion in _cases(data, clips):
-        performer = open_performer(body, motion, data)
-        length_s = performer.duration_s + 2.0 if seconds is None else min(seconds, performer.duration_s + 2.0)
-        for condition in CONDITIONS:
-            case = f"gauss-newton/{body}/{motion or 'routine'}/{condition}"
-            started = time.monotonic()
-            result = (_points_given if condition == "points-given" else _depth_auto)(performer, length_s)
-            metrics = result.metrics()
-            rows += [_row(case, metric, *value) for metric, value in metrics.items()]
-            summary = "  ".join(f"{m} {v:.4f}" for m, (v, _) in metrics.items() if v is not None)
-            print(f"{case}: {summary}  ({time.monotonic() - started:.0f} s)", file=sys.stderr, flush=True)
-    return rows
+    groups: dict[tuple[str, str, str], list[Result]] = {}
+    for result in results:
+        kind = "clean clips" if is_clean(result.flipped, result.frames) else "clips with flips"
+        groups.setdefault((result.case.tracker, kind, result.case.condition), []).append(result)
+    for (tracker, kind, seen), members in groups.items():
+        for metric in _metrics_of(members):
+            values = [member.metrics[metric] for member in members if metric in member.metrics]
+            value = max(values) if metric == "e_t_max" else float(np.mean(values))
+            yield _row(f"{tracker}/all/{kind}/{seen}", metric, value, f"{len(values)} cases")
 
 
-def _cases(data: Path | None, clips: list[str] | None) -> Iterator[tuple[str, str | None]]:
-    if clips is None or "routine" in clips:
-        yield "builtin", None
-    if data is None:
-        return
-    there = json.loads((data / "mocap" / "clips.json").read_text())
-    unknown = set(clips or ()) - set(there) - {"routine"}
+def _metrics_of(results: list[Result]) -> list[str]:
+    return list(dict.fromkeys(metric for result in results for metric in result.metrics))
+
+
+def _names(text: str) -> list[str]:
+    return [name for name in text.split(",") if name]
+
+
+def _cases(
+    data: Path | None,
+    seconds: float | None,
+    clips: tuple[str, ...],
+    trackers: list[str],
+    conditions: list[str],
+    bodies: list[str],
+) -> Iterator[Case]:
+    """Every combination; the built-in performer plays its routine, the bodies of ``data`` its clips."""
+    there = [] if data is None else list(json.loads((data / "mocap" / "clips.json").read_text()))
+    persons = [] if data is None else sorted(path.stem for path in (data / "bodies").glob("*.npz"))
+    _check("clip", clips, [ROUTINE, *there])
+    _check("tracker", trackers, TRACKERS)
+    _check("body", bodies, ["builtin", *persons])
+    try:
+        seen = [condition(name).name for name in conditions]
+    except ValueError as error:
+        raise SystemExit(str(error)) from None
+    pairs = [("builtin", ROUTINE)] + [(body, clip) for clip in there for body in persons]
+    for tracker in trackers:
+        for name in seen:
+            for body, clip in pairs:
+                if (not clips or clip in clips) and (not bodies or body in bodies):
+                    yield Case(tracker, body, clip, name, data, seconds)
+
+
+def _check(what: str, names: Iterable[str], there: Iterable[str]) -> None:
+    unknown = set(names) - set(there)
     if unknown:
-        raise SystemExit(f"no clip {', '.join(sorted(unknown))}; there are: routine, {', '.join(sorted(there))}")
-    for clip in there if clips is None else [clip for clip in clips if clip != "routine"]:
-        for body in sorted(path.stem for path in (data / "bodies").glob("*.npz")):
-            yield body, clip
+        raise SystemExit(f"no {what} {', '.join(sorted(unknown))}; there are: {', '.join(there)}")
 
 
-def _row(case: str, metric: str, value: float | None, unit: str) -> dict[str, Any]:
-    reference, source = _REFERENCES.get(metric, (None, ""))
-    return {"case": case, "metric": metric, "value": value, "unit": unit, "reference": reference, "source": source}
+def _measured(cases: list[Case], jobs: int, stack: ExitStack) -> Iterator[Result]:
+    """The cases' results in order, ``jobs`` at a time."""
+    trackers = sorted({case.tracker for case in cases})
+    if jobs == 1:
+        _warm_up(trackers)
+        return map(_measure, cases)
+    context = multiprocessing.get_context("spawn")
+    pool = stack.enter_context(ProcessPoolExecutor(jobs, context, _warm_up, (trackers,)))
+    stack.callback(pool.shutdown, cancel_futures=True)
+    return pool.map(_measure, cases)
 
 
-def _warm_up() -> None:
+def _warm_up(trackers: list[str]) -> None:
     """Compiles or loads every kernel, so that the first case's times are the tracker's own."""
-    _depth_auto(open_performer("builtin", None, None), 0.2)
+    for tracker in trackers:
+        for seen in ("points-given", "depth1-auto"):
+            _measure(Case(tracker, "builtin", ROUTINE, seen, None, WARM_UP_S))
 
 
-def _points_given(performer: Performer, length_s: float) -> Run:
-    tracker = GaussNewtonTracker(GaussNewtonSettings())
-    random = np.random.default_rng(0)
-    result = Run()
-    for frame in range(int(length_s * FRAME_RATE_HZ)):
-        time_s = frame / FRAME_RATE_HZ
-        surface, joints = performer.surface(time_s), performer.named_joints(time_s)
-        cloud = surface_points(surface, performer.mesh.faces, performer.mesh.vertex_colours, POINTS, random)
-        begun = time.thread_time()
-        if frame == 0:
-            skeleton, pose = skeleton_from_joints(joints.astype(np.float64), float(np.ptp(surface[:, 1])))
-            fit: FitResult | None = tracker.start_from(skeleton, pose, cloud, 0)
-        else:
-            fit = tracker.track(cloud, round(time_s * 1e9))
-        result.add(fit, time.thread_time() - begun, joints, bounding_ball_radius(surface), time_s)
-    return result
+def _measure(case: Case) -> Result:
+    seen = condition(case.condition)
+    performer = performer_for(seen, case.body, None if case.clip == ROUTINE else case.clip, case.data)
+    run = follow(open_tracker(case.tracker), sights(performer, seen, case.seconds), seen.start == "given")
+    metrics = run.metrics()
+    if seen.start == "given":
+        metrics.pop("time_to_skeleton_s", None)
+    e_t = run.e_t().tolist() if run.times_s else []
+    return Result(case, metrics, *flips_of(performer), run.times_s, e_t)
 
 
-def _depth_auto(performer: Performer, length_s: float) -> Run:
-    renderer = RigRenderer(performer, RigSettings(cameras=CAMERAS))
-    backgrounds = [
-        BackgroundModel(camera, renderer.empty_room(index), BackgroundSettings())
-        for index, camera in enumerate(renderer.cameras)
-    ]
-    sampler = PointSampler(renderer.cameras, POINTS)
-    tracker = GaussNewtonTracker(GaussNewtonSettings())
-    result = Run()
-    for frame in range(int(length_s * FRAME_RATE_HZ)):
-        time_s = frame / FRAME_RATE_HZ
-        views = []
-        for index, camera in enumerate(renderer.cameras):
-            depth = np.empty((camera.height, camera.width), np.uint16)
-            colour = np.empty((camera.height, camera.width, 3), np.uint8)
-            renderer.view(index, time_s, depth, colour)
-            views.append(backgrounds[index].foreground(DepthFrame(index, frame, round(time_s * 1e9), depth, colour)))
-        cloud = sampler.points([view for view in views if view is not None])
-        begun = time.thread_time()
-        fit = tracker.track(cloud, round(time_s * 1e9))
-        cpu_s = time.thread_time() - begun
-        result.add(fit, cpu_s, performer.named_joints(time_s), bounding_ball_radius(performer.surface(time_s)), time_s)
-    return result
+def _summary(result: Result) -> str:
+    return f"{result.case.name}: " + "  ".join(f"{name} {value:.4g}" for name, value in result.metrics.items())
 
 
-def surface_points(
-    vertices: Array, faces: Array, colours: Array, count: int, random: np.random.Generator
-) -> PointCloud:
-    """``count`` points spread evenly over a mesh: ``vertices`` (V, 3) [m], ``faces`` (F, 3), ``colours`` (V, 3)."""
-    a, b, c = (vertices[faces[:, corner]] for corner in range(3))
-    normals = np.cross(b - a, c - a)
-    areas = np.linalg.norm(normals, axis=1)
-    chosen = random.choice(len(faces), count, p=areas / areas.sum())
-    s, t = np.sort(random.random((2, count, 1)), axis=0)
-    points = a[chosen] * s + b[chosen] * (t - s) + c[chosen] * (1 - t)
-    unit = normals[chosen] / np.maximum(areas[chosen, None], 1e-12)
-    return PointCloud(points.astype(np.float32), unit.astype(np.float32), colours[faces[chosen, 0]])
+def _rows(result: Result, jobs: int) -> Iterator[Row]:
+    for metric, value in result.metrics.items():
+        remarks = [f"glitches: {result.flipped} of {result.frames} frames"] if result.flipped else []
+        if jobs > 1 and metric.startswith("ms_"):
+            remarks.append(f"{jobs} cases at a time: noisy")
+        yield _row(result.case.name, metric, value, "; ".join(remarks))
+
+
+def _row(case: str, metric: str, value: float, remark: str) -> Row:
+    reference, source = _REFERENCES.get(metric, (None, "")) if case.endswith("/points-given") else (None, "")
+    unit = _UNITS.get(metric, "R")
+    joined = "; ".join(part for part in (source, remark) if part)
+    return {"case": case, "metric": metric, "value": value, "unit": unit, "reference": reference, "source": joined}

@@ -1,8 +1,10 @@
 """Runs one bench, prints its rows as a table and writes them as JSON.
 
 A bench is a file ``scripts/bench_NAME.py``: its docstring says what it measures, and it has
-``run(data: Path | None, seconds: float | None, clips: tuple[str, ...]) -> list[Row]``. ``seconds`` bounds each case,
-``clips`` the cases; None and () mean all there is. Progress goes to stderr.
+``run(data: Path | None, seconds: float | None, clips: tuple[str, ...]) -> Iterable[Row]``. ``seconds`` bounds each
+case, ``clips`` the cases; None and () mean all there is. A bench with options of its own declares them in
+``add_options(parser)`` and gets them as further arguments of ``run``. Progress goes to stderr. The JSON file is written
+after every case, so that a bench cut off keeps what it has.
 """
 
 from __future__ import annotations
@@ -12,7 +14,9 @@ import ast
 import importlib
 import json
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from itertools import groupby
+from operator import itemgetter
 from pathlib import Path
 from typing import TypedDict
 
@@ -60,21 +64,34 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--json", type=Path, help="file for the rows as JSON")
     parser.add_argument("--seconds", type=float, help="at most so many seconds of motion per case")
     parser.add_argument("--clips", default="", help="only these clips, separated by commas")
-    options = parser.parse_args(arguments)
-    if options.name is None:
+    words = list(sys.argv[1:] if arguments is None else arguments)
+    if not words:
         print("\n".join(f"{name:12} {about}" for name, about in known.items()) or "no benches here")
         return 0
-    if options.data is not None and not options.data.is_dir():
-        parser.error(f"--data {options.data}: no such folder")
-    if options.seconds is not None and options.seconds <= 0:
+    bench = importlib.import_module(f"scripts.{PREFIX}{words[0]}") if words[0] in known else None
+    if bench is not None and hasattr(bench, "add_options"):
+        bench.add_options(parser)
+    options = vars(parser.parse_args(words))
+    name, json_file = options.pop("name"), options.pop("json")
+    if bench is None:
+        parser.error("the bench's NAME comes first")
+    if options["data"] is not None and not options["data"].is_dir():
+        parser.error(f"--data {options['data']}: no such folder")
+    if options["seconds"] is not None and options["seconds"] <= 0:
         parser.error("--seconds must be positive")
-    clips = tuple(clip for clip in options.clips.split(",") if clip)
-    bench = importlib.import_module(f"scripts.{PREFIX}{options.name}")
-    rows: list[Row] = bench.run(data=options.data, seconds=options.seconds, clips=clips)
-    print(table(rows))
-    if options.json is not None:
-        options.json.write_text(json.dumps({"bench": options.name, "rows": rows}, indent=1) + "\n")
+    options["clips"] = tuple(clip for clip in options["clips"].split(",") if clip)
+    print(table(kept(bench.run(**options), name, json_file)))
     return 0
+
+
+def kept(rows: Iterable[Row], bench: str, file: Path | None) -> list[Row]:
+    """All rows, written to ``file`` after each case."""
+    so_far: list[Row] = []
+    for _, case in groupby(rows, key=itemgetter("case")):
+        so_far += case
+        if file is not None:
+            file.write_text(json.dumps({"bench": bench, "rows": so_far}, indent=1) + "\n")
+    return so_far
 
 
 def _number(value: float | int | None) -> str:

@@ -12,8 +12,8 @@ from common.body.skeleton import LINK_COUNT, LINK_INDEX, NAMED_JOINT_LINKS
 from common.body.skeleton_pose import SkeletonPose, forward_kinematics, joint_positions, named_joint_positions
 from common.geometry import quaternion
 from common.geometry.point_cloud import PointCloud
-from scripts.bench_tracking import surface_points
 from scripts.fidelity import bounding_ball_radius
+from scripts.tracking_conditions import surface_points
 from sender.capture.performer import Performer, open_performer
 from sender.fitting.articulated_gauss_newton import PoseState, Schedule, forward
 from sender.fitting.body_fitter import BodyFitter

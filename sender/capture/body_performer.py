@@ -33,7 +33,7 @@ class PoseTrack:
 class BodyPerformer:
     """Performer: the body's A-pose, a blend into the first pose of the track, then the track for ever.
 
-    ``duration_s``: A-pose, blend and the track once (to and fro unless it is cyclic).
+    ``duration_s``: A-pose, blend and the track once (to and fro unless it is cyclic); ``motion_s``: and only to.
     """
 
     def __init__(self, body: SkinnedBody, track: PoseTrack, name: str) -> None:
@@ -46,22 +46,29 @@ class BodyPerformer:
         length_s = (len(track.root) - 1) / track.frame_rate_hz
         self._period_s = length_s if track.cyclic else 2 * (length_s + TURN_S)
         self.duration_s = REST_S + BLEND_S + self._period_s
+        self.motion_s = REST_S + BLEND_S + length_s
 
     def surface(self, time_s: float) -> NDArray[np.float32]:
         """Vertices (V, 3) float32 [m, world] at ``time_s`` >= 0 since the start."""
-        return self._body.surface(self._joints(time_s))
+        return self._body.surface(self._body.joint_transforms(*self._pose(time_s)))
 
     def named_joints(self, time_s: float) -> NDArray[np.float32]:
         """True positions (16, 3) float32 [m, world] of ``NAMED_JOINTS`` at ``time_s`` >= 0."""
-        return np.ascontiguousarray(self._joints(time_s)[self._named, :, 3], np.float32)
+        T = self._body.joint_transforms(*self._pose(time_s))
+        return np.ascontiguousarray(T[self._named, :, 3], np.float32)
 
-    def _joints(self, time_s: float) -> Floats:
+    def named_rotations(self, time_s: float) -> Floats:
+        """True rotations (16, 4) of the links at ``NAMED_JOINTS``, each relative to the body's joint above it."""
+        return self._pose(time_s)[0][self._named]
+
+    def _pose(self, time_s: float) -> tuple[Floats, Floats]:
+        """Local rotations (J, 4) and root position (3,) [m]."""
         playing_s = time_s - REST_S - BLEND_S
         if playing_s < 0:
-            return _pose(self._body, self._opening, max(time_s - REST_S, 0.0))
+            return _between(self._opening, max(time_s - REST_S, 0.0))
         if self._track.cyclic:
-            return _pose(self._body, self._track, playing_s % self._period_s)
-        return _pose(self._body, self._track, to_and_fro(playing_s, self._period_s / 2 - TURN_S, TURN_S))
+            return _between(self._track, playing_s % self._period_s)
+        return _between(self._track, to_and_fro(playing_s, self._period_s / 2 - TURN_S, TURN_S))
 
 
 def to_and_fro(time_s: float, length_s: float, turn_s: float) -> float:
@@ -78,14 +85,14 @@ def to_and_fro(time_s: float, length_s: float, turn_s: float) -> float:
     return min(max(place - turn_s / 2, 0.0), length_s)
 
 
-def _pose(body: SkinnedBody, track: PoseTrack, time_s: float) -> Floats:
-    """``T_world_joint`` (J, 3, 4) between the two poses around ``time_s``."""
+def _between(track: PoseTrack, time_s: float) -> tuple[Floats, Floats]:
+    """Local rotations (J, 4) and root position (3,) [m] between the two poses around ``time_s``."""
     place = min(time_s * track.frame_rate_hz, len(track.root) - 1.0)
     before = min(int(place), len(track.root) - 2)
     share = place - before
     local = quaternion.slerp(track.local[before], track.local[before + 1], share)
     root = (1 - share) * track.root[before] + share * track.root[before + 1]
-    return body.joint_transforms(local, root)
+    return local, root
 
 
 def _opening(body: SkinnedBody, track: PoseTrack) -> PoseTrack:

@@ -39,11 +39,14 @@ class Performer(Protocol):
         ...
 
 
-def open_performer(name: str, motion: str | None = None, data: Path | None = None) -> Performer:
+def open_performer(
+    name: str, motion: str | None = None, data: Path | None = None, on_the_spot: bool = True
+) -> BodyPerformer:
     """The performer ``name`` in ``motion``.
 
     ``name``: "builtin" or a body of ``data``/bodies. ``motion``: a clip of ``data``/mocap, or None for the built-in
-    routine (30 s: wave, T-pose, fold arms, squat, turn, steps, kick).
+    routine (30 s: wave, T-pose, fold arms, squat, turn, steps, kick). ``on_the_spot``: clips that travel metres are
+    kept where cameras see them.
 
     Raises:
         CaptureError: unknown body or motion (the message lists those there are), or data that cannot be read.
@@ -53,7 +56,7 @@ def open_performer(name: str, motion: str | None = None, data: Path | None = Non
         return BodyPerformer(body, retarget(body, routine()), name)
     if data is None:
         raise CaptureError(f"motion {motion!r} needs a data folder with mocap/clips.json")
-    return BodyPerformer(body, retarget(body, read_clip(data / "mocap", motion)), f"{name}/{motion}")
+    return BodyPerformer(body, retarget(body, read_clip(data / "mocap", motion), on_the_spot), f"{name}/{motion}")
 
 
 def _body_of(name: str, data: Path | None) -> SkinnedBody:

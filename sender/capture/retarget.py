@@ -57,12 +57,12 @@ _LIMBS = (("UpLeg", "Leg", "Foot"), ("Arm", "ForeArm", "Hand"))
 _FOLLOWING = ("HandFinger1", "Thumb")
 
 
-def retarget(body: SkinnedBody, clip: MotionClip) -> PoseTrack:
+def retarget(body: SkinnedBody, clip: MotionClip, on_the_spot: bool = True) -> PoseTrack:
     """The clip as poses of the body, at the clip's frame rate.
 
     The person faces +Z in the first frame, stands on y = 0 and stays near the origin: clips that travel more than
-    ``TRAVEL_M`` lose their smoothed horizontal path, others are centred. A clip with ``support`` is cyclic and its feet
-    stand where they are put.
+    ``TRAVEL_M`` lose their smoothed horizontal path unless ``on_the_spot`` is False, others are centred. A clip with
+    ``support`` is cyclic and its feet stand where they are put.
 
     Raises:
         CaptureError: the body has a joint no bone drives, or the clip lacks a bone.
@@ -77,7 +77,7 @@ def retarget(body: SkinnedBody, clip: MotionClip) -> PoseTrack:
     local[:, 0] = quaternion.multiply(heading, local[:, 0])
     root = (path - start - offset) @ quaternion.to_matrix(heading).T + start
     if clip.support is None:
-        root[:, [0, 2]] -= _horizontal_path(root[:, [0, 2]], clip.frame_rate_hz)
+        root[:, [0, 2]] -= _horizontal_path(root[:, [0, 2]], clip.frame_rate_hz, on_the_spot)
         root[:, 1] -= np.percentile(body.lowest_foot(local, root), _FLOOR_PERCENTILE)
     else:
         root[:, [0, 2]] = _path_of_standing_feet(body, local, clip.support)
@@ -168,11 +168,13 @@ def _heading(hips: Floats) -> Floats:
     return quaternion.from_rotation_vector(np.array([0.0, -np.arctan2(forward[0], forward[2]), 0.0]))
 
 
-def _horizontal_path(path: Floats, frame_rate_hz: float) -> Floats:
-    """What to take off a horizontal path (F, 2) [m] so that it stays near the origin."""
+def _horizontal_path(path: Floats, frame_rate_hz: float, on_the_spot: bool) -> Floats:
+    """What to take off a horizontal path (F, 2) [m] so that it stays near the origin, or starts there."""
     low, high = path.min(axis=0), path.max(axis=0)
     if np.linalg.norm(high - low) <= TRAVEL_M:
         return np.broadcast_to((low + high) / 2, path.shape)
+    if not on_the_spot:
+        return np.broadcast_to(path[0], path.shape)
     return gaussian_filter1d(path, _TREADMILL_S * frame_rate_hz, axis=0, mode="reflect")
 
 
