@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from common.body.skeleton import LINK_PARENTS, Skeleton
-from common.body.skeleton_pose import bone_segments, forward_kinematics
+from common.body.skeleton_pose import SkeletonPose, bone_segments, forward_kinematics
 from common.geometry.camera_model import Camera, project
 from common.wire.skeleton_packet import SkeletonPacket
 from scripts.daemon_processes import site
@@ -61,16 +61,9 @@ def tile(
     recording: Recording, camera: int, number: int, packet: SkeletonPacket | None, bodies: dict[int, Skeleton]
 ) -> NDArray[np.uint8]:
     """One frame with its skeleton."""
-    depth, colour = recording.load(camera, number)
-    near, far = np.percentile(depth[depth > 0], [1, 99]) if (depth > 0).any() else (0, 1)
-    grey = np.clip(230 - 180 * (depth.astype(float) - near) / max(far - near, 1), 30, 255).astype(np.uint8)
-    picture = np.repeat(np.where(depth > 0, grey, 0)[..., None], 3, axis=2).astype(np.uint8)
-    if colour is not None:
-        picture = (colour // 2 + picture // 2).astype(np.uint8)
-    scale = TILE_HEIGHT / picture.shape[0]
-    picture = np.asarray(cv2.resize(picture, None, fx=scale, fy=scale), np.uint8)
+    picture, scale = picture_of(*recording.load(camera, number))
     if packet is not None and packet.body_revision in bodies:
-        draw(picture, recording.cameras[camera], packet, bodies[packet.body_revision], scale)
+        draw(picture, recording.cameras[camera], bodies[packet.body_revision], packet.pose, scale)
         label = f"{number}: fit {packet.fit_confidence:.2f}"
     else:
         label = f"{number}: no skeleton"
@@ -78,18 +71,37 @@ def tile(
     return picture
 
 
-def draw(picture: NDArray[np.uint8], camera: Camera, packet: SkeletonPacket, body: Skeleton, scale: float) -> None:
+def picture_of(depth: NDArray[np.uint16], colour: NDArray[np.uint8] | None) -> tuple[NDArray[np.uint8], float]:
+    """A frame as a picture of ``TILE_HEIGHT`` rows, and how much larger that is than the frame."""
+    near, far = np.percentile(depth[depth > 0], [1, 99]) if (depth > 0).any() else (0, 1)
+    grey = np.clip(230 - 180 * (depth.astype(float) - near) / max(far - near, 1), 30, 255).astype(np.uint8)
+    picture = np.repeat(np.where(depth > 0, grey, 0)[..., None], 3, axis=2).astype(np.uint8)
+    if colour is not None:
+        picture = (colour // 2 + picture // 2).astype(np.uint8)
+    scale = TILE_HEIGHT / picture.shape[0]
+    picture = np.asarray(cv2.resize(picture, None, fx=scale, fy=scale), np.uint8)
+    return picture, scale
+
+
+def draw(picture: NDArray[np.uint8], camera: Camera, skeleton: Skeleton, pose: SkeletonPose, scale: float) -> None:
     """Bones of the links that were seen, in the picture's pixels."""
-    starts, ends = bone_segments(body, forward_kinematics(body, packet.pose))
+    starts, ends = bone_segments(skeleton, forward_kinematics(skeleton, pose))
     first, _ = project(camera, starts)
     last, _ = project(camera, ends)
     for link in range(len(LINK_PARENTS)):
-        if packet.pose.confidence[link] < SEEN:
+        if pose.confidence[link] < SEEN:
             continue
         colour = MIDDLE if link < 5 else LEFT if link < 14 else RIGHT
         a, b = (tuple(int(v) for v in end[link] * scale) for end in (first, last))
         cv2.line(picture, a, b, colour, 2, cv2.LINE_AA)
         cv2.circle(picture, a, 3, colour, -1, cv2.LINE_AA)
+
+
+def dots(picture: NDArray[np.uint8], camera: Camera, points: NDArray[np.floating], scale: float) -> None:
+    """White dots at ``points`` (N, 3) [m, world], in the picture's pixels."""
+    pixels, _ = project(camera, points)
+    for u, v in pixels * scale:
+        cv2.circle(picture, (int(u), int(v)), 3, (255, 255, 255), 1, cv2.LINE_AA)
 
 
 if __name__ == "__main__":
