@@ -29,10 +29,11 @@ class RepositorySettings:
 @dataclass(frozen=True, slots=True)
 class ViewSettings:
     """``headless``: render offscreen instead of serving a page. ``display_hz``: rate of display ticks.
-    ``allowed_hosts``: names besides loopback under which browsers may open the page."""
+    ``skinning``: how a mesh bends at its joints. ``allowed_hosts``: names besides loopback ones for the page."""
 
     headless: bool = False
     display_hz: float = 30.0
+    skinning: Literal["rigid", "linear", "spherical"] = "spherical"
     allowed_hosts: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:

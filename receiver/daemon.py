@@ -103,9 +103,9 @@ class _Show:
         self._meshes: deque[ReceivedPose] = deque()  # meshed, waiting for the next skeleton; bounded in _mesh_poses
         self._log = ShowLog(settings.shown_log) if settings.shown_log else None
         self.viewer: WebViewer | HeadlessScreen = (
-            HeadlessScreen(self._timer)
+            HeadlessScreen(self._timer, skinning=settings.view.skinning)
             if settings.view.headless
-            else WebViewer(allowed_hosts=settings.view.allowed_hosts)
+            else WebViewer(allowed_hosts=settings.view.allowed_hosts, skinning=settings.view.skinning)
         )
         self.metrics = self._make_metrics()
 

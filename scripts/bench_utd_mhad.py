@@ -162,7 +162,7 @@ def _moving(track: Track, distances: Floats) -> tuple[Floats, Floats]:
 
 def _contact_sheet(folder: Path, tracks: list[Track], errors: list[Floats], file: Path) -> None:
     """Frames spread over the sequences and their time, our bones over the depth, the SDK's joints as white dots."""
-    tiles = []
+    tiles: list[np.ndarray] = []
     for place in np.linspace(0, len(tracks) - 1, min(SHEET, len(tracks))).astype(int):
         track, error = tracks[place], errors[place]
         number = int((0.3 + 0.4 * (len(tiles) % 2)) * len(track.fits))  # arms are up around the middle

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from common.body.rigged_mesh import RiggedMesh, build_rigged_mesh
 from common.body.skeleton import NAMED_JOINT_LINKS, Skeleton
 from common.body.skeleton_pose import forward_kinematics
-from common.body.skinning import animate_rigid, link_motion
+from common.body.skinning import animate, link_motion
 from common.geometry.rasterizer import render
 from common.wire.body_message import decode_body
 from common.wire.candidate_pose import decode_candidate_pose
@@ -161,7 +161,7 @@ def picture_fidelity(
     cameras = measuring_cameras(surface)
     look = performer.mesh
     true_colours = look.vertex_colours if look.uv is None or look.texture is None else (look.uv, look.texture)
-    vertices = animate_rigid(mesh, link_motion(mesh, T_world_link))
+    vertices = animate(mesh, link_motion(mesh, T_world_link))
     truth = [render(surface, look.faces, true_colours, camera) for camera in cameras]
     return compare(truth, [render(vertices, mesh.faces_drawn, mesh.mesh.surface, camera) for camera in cameras])
 

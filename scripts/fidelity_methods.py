@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from common.body.rigged_mesh import RiggedMesh
 from common.body.skeleton import LINK_COUNT, Skeleton
 from common.body.skeleton_pose import SkeletonPose, forward_kinematics
-from common.body.skinning import animate_rigid, link_motion
+from common.body.skinning import animate, link_motion
 from common.geometry.camera_model import Camera
 from common.geometry.rasterizer import render
 from common.runtime.stage_timer import StageTimer
@@ -83,7 +83,7 @@ class _Animated:
         if self._shown is None:
             return None
         mesh, motion = self._shown
-        vertices = animate_rigid(mesh, motion)
+        vertices = animate(mesh, motion)
         return [render(vertices, mesh.faces_drawn, mesh.mesh.surface, camera) for camera in cameras]
 
 

@@ -11,6 +11,7 @@ from common.body.rigged_mesh import RiggedMesh, joint_edges
 from common.body.skeleton import LINK_COUNT, LINK_INDEX, Skeleton, human_skeleton
 from common.body.skeleton_pose import SkeletonPose, bone_segments, forward_kinematics, joint_positions, rest_pose
 from common.body.skinning import link_motion
+from common.body.vertex_blend import vertex_blend
 from common.geometry.rigid_transform import inverse
 from common.geometry.triangle_mesh import TriangleMesh
 from receiver.viewer.viewer import ShownFrame
@@ -56,7 +57,8 @@ def capsule_person(pose_id: int = 0, pose: SkeletonPose | None = None) -> Rigged
     vertex_link = np.repeat(np.arange(LINK_COUNT, dtype=np.uint8), per_link)
     T_link_world = inverse(T_world_link.astype(np.float64))
     edges = joint_edges(mesh, vertex_link, T_link_world)
-    return RiggedMesh(pose_id, 0, SKELETON, pose, T_link_world, mesh, vertex_link, mesh.faces, edges)
+    blend = vertex_blend(mesh.vertices, vertex_link, SKELETON, T_world_link)
+    return RiggedMesh(pose_id, 0, SKELETON, pose, T_link_world, mesh, vertex_link, blend, mesh.faces, edges)
 
 
 def shown_frame(mesh: RiggedMesh | None, time_s: float, sequence: int = 0) -> ShownFrame:

@@ -6,6 +6,7 @@ import asyncio
 import itertools
 from collections.abc import AsyncIterator, Callable
 from contextlib import AsyncExitStack, asynccontextmanager
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -13,6 +14,9 @@ from aiohttp import web
 from aiohttp.test_utils import TestServer, unused_port
 from numpy.typing import NDArray
 
+from common.body.skinning import Skinning
+from common.geometry.camera_model import Camera
+from receiver.viewer.offscreen_viewer import OffscreenViewer
 from receiver.viewer.viewer import ConnectionState, ViewerStatus
 from receiver.viewer.web_viewer import PAGE_FOLDER, WebViewer
 from tests.capsule_person import SHIRT, SKIN, TROUSERS, capsule_person, shown_frame
@@ -41,9 +45,9 @@ def figure(name: str) -> str:
 
 
 @asynccontextmanager
-async def receiver(port: int | None = None) -> AsyncIterator[tuple[WebViewer, str]]:
+async def receiver(port: int | None = None, skinning: Skinning = "spherical") -> AsyncIterator[tuple[WebViewer, str]]:
     """A viewer and the address of its page."""
-    viewer = WebViewer()
+    viewer = WebViewer(skinning=skinning)
     app = web.Application()
     viewer.add_routes(app)
     async with TestServer(app, port=port) as server:
@@ -95,6 +99,38 @@ async def test_person_moves_on_the_canvas(width: int, height: int, phone: bool) 
         arms = coloured(first, SKIN)
         await photograph_when(page, lambda p: (coloured(p, SKIN) ^ arms).sum() > 200)  # they have moved
         assert page.problems == []
+
+
+@pytest.mark.parametrize("skinning", get_args(Skinning))
+async def test_page_and_offscreen_renderer_agree(skinning: Skinning) -> None:
+    """The same mesh, bent far, by the page's vertex shader and by the offscreen renderer, from the page's camera."""
+    person = capsule_person(pose_id=7)
+    frame = shown_frame(person, 2.3)
+    async with receiver(skinning=skinning) as (viewer, url), open_page(url, 800, 600) as page:
+        viewer.add_pose(person)
+        viewer.set_status(RECEIVING)
+        viewer.show(frame)
+        await page.press("h")
+        picture = await photograph_when(page, lambda p: coloured(p, SHIRT).sum() > 500)
+        world = np.reshape(
+            await page.evaluate("document.getElementById('stage').camera.matrixWorld.elements"), (4, 4)
+        ).T
+        focal = (
+            300
+            * np.reshape(
+                await page.evaluate("document.getElementById('stage').camera.projectionMatrix.elements"), (4, 4)
+            )[1, 1]
+        )
+    T_world_camera = world @ np.diag([1.0, -1.0, -1.0, 1.0])  # WebGL looks along -z, y up
+    offscreen = OffscreenViewer(skinning)
+    offscreen.add_pose(person)
+    offscreen.show(frame)
+    expected = offscreen.render([Camera("page", 800, 600, focal, focal, 399.5, 299.5, T_world_camera)])[0][0]
+    room = ~(coloured(picture, SHIRT) | coloured(picture, SKIN) | coloured(picture, TROUSERS))
+    picture[room] = 255
+    error = (picture.astype(float) - expected) ** 2
+    assert 10 * np.log10(255**2 / error.mean()) >= 35
+    assert page.problems == []
 
 
 async def test_page_that_comes_late_shows_the_last_frame() -> None:

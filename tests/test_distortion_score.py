@@ -17,7 +17,7 @@ from common.body.distortion_score import (
 from common.body.rigged_mesh import RiggedMesh, joint_edges
 from common.body.skeleton import LINK_COUNT, LINK_INDEX
 from common.body.skeleton_pose import SkeletonPose
-from common.body.skinning import animate_rigid, link_motion
+from common.body.skinning import animate, link_motion
 from tests.capsule_views import arms_down_by, captured, links_of
 
 WEIGHTS = default_region_weights()
@@ -26,7 +26,7 @@ EQUAL = np.ones(LINK_COUNT, np.float32)
 
 def by_the_book(mesh: RiggedMesh, pose: SkeletonPose, weights: np.ndarray) -> float:
     """Animate everything, take every edge of every triangle, Eq. (1) per region, Eq. (2)."""
-    before, after = mesh.mesh.vertices, animate_rigid(mesh, link_motion(mesh, links_of(pose)))
+    before, after = mesh.mesh.vertices, animate(mesh, link_motion(mesh, links_of(pose)), "rigid")
     pairs = {
         (min(a, b), max(a, b))
         for face in mesh.mesh.faces.tolist()

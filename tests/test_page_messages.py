@@ -14,6 +14,8 @@ from hypothesis import strategies as st
 
 from common.body.rigged_mesh import RiggedMesh
 from common.body.skeleton import LINK_COUNT, LINK_PARENTS
+from common.body.skinning import captured_joints
+from common.body.vertex_blend import VertexBlend
 from common.geometry.triangle_mesh import TriangleMesh
 from receiver.viewer import page_messages
 from receiver.viewer.viewer import ConnectionState, ViewerStatus
@@ -31,7 +33,11 @@ def trimmed(vertices: int) -> RiggedMesh:
         PERSON.mesh.texture,
     )
     return dataclasses.replace(
-        PERSON, mesh=mesh, vertex_link=PERSON.vertex_link[:vertices], faces_drawn=mesh.faces.copy()
+        PERSON,
+        mesh=mesh,
+        vertex_link=PERSON.vertex_link[:vertices],
+        blend=VertexBlend(PERSON.blend.other[:vertices], PERSON.blend.share[:vertices], PERSON.blend.joint[:vertices]),
+        faces_drawn=mesh.faces.copy(),
     )
 
 
@@ -40,7 +46,10 @@ def large() -> RiggedMesh:
     mesh, copies = PERSON.mesh, 65537 // len(PERSON.mesh.vertices) + 1
     faces = np.concatenate([mesh.faces, mesh.faces + (copies - 1) * len(mesh.vertices)]).astype(np.int32)
     many = TriangleMesh(np.tile(mesh.vertices, (copies, 1)), faces, np.tile(mesh.uv, (copies, 1)), mesh.texture)
-    return dataclasses.replace(PERSON, mesh=many, vertex_link=np.tile(PERSON.vertex_link, copies), faces_drawn=faces)
+    links = np.tile(PERSON.vertex_link, copies)
+    parts = (PERSON.blend.other, PERSON.blend.share, PERSON.blend.joint)
+    blend = VertexBlend(*(np.tile(part, copies) for part in parts))
+    return dataclasses.replace(PERSON, mesh=many, vertex_link=links, blend=blend, faces_drawn=faces)
 
 
 def padded(length: int) -> int:
@@ -59,8 +68,9 @@ def test_pose_message_holds_the_mesh(mesh: RiggedMesh) -> None:
     quantized = np.frombuffer(message, "<u2", 3 * vertices, 40).reshape(-1, 3)
     uv_offset = 40 + padded(6 * vertices)
     uv = np.frombuffer(message, "<u2", 2 * vertices, uv_offset).reshape(-1, 2) / 65535
-    links = np.frombuffer(message, np.uint8, vertices, uv_offset + 4 * vertices)
-    index_offset = uv_offset + 4 * vertices + padded(vertices)
+    skin = np.frombuffer(message, np.uint8, 4 * vertices, uv_offset + 4 * vertices).reshape(-1, 4)
+    joints = np.frombuffer(message, "<f4", 3 * LINK_COUNT, uv_offset + 8 * vertices).reshape(-1, 3)
+    index_offset = uv_offset + 8 * vertices + 12 * LINK_COUNT
     index_type = np.dtype("<u2" if vertices <= 65536 else "<u4")
     index = np.frombuffer(message, index_type, 3 * faces, index_offset).reshape(-1, 3)
     jpeg = message[index_offset + padded(3 * faces * index_type.itemsize) :]
@@ -68,7 +78,9 @@ def test_pose_message_holds_the_mesh(mesh: RiggedMesh) -> None:
 
     assert np.abs(box_min + box_size * (quantized / 65535) - mesh.mesh.vertices).max() < 2e-5  # half a step of 1.9 m
     assert np.abs(uv - mesh.mesh.uv).max() < 1e-5
-    np.testing.assert_array_equal(links, mesh.vertex_link)
+    blend = mesh.blend
+    np.testing.assert_array_equal(skin, np.stack([mesh.vertex_link, blend.other, blend.joint, blend.share], axis=1))
+    np.testing.assert_array_equal(joints, captured_joints(mesh))
     np.testing.assert_array_equal(index, mesh.faces_drawn)
     assert texture is not None
     assert texture.shape == mesh.mesh.texture.shape
@@ -148,8 +160,9 @@ def test_status_is_json_even_where_numbers_are_missing() -> None:
 
 
 def test_hello_tells_the_link_tree() -> None:
-    hello = json.loads(page_messages.encode_hello())
-    assert hello == {"kind": "hello", "version": page_messages.VERSION, "link_parents": list(LINK_PARENTS)}
+    hello = json.loads(page_messages.encode_hello("linear"))
+    version, parents = page_messages.VERSION, list(LINK_PARENTS)
+    assert hello == {"kind": "hello", "version": version, "skinning": "linear", "link_parents": parents}
 
 
 @given(st.binary(max_size=16))

@@ -8,7 +8,7 @@ import pytest
 from common.body.depth_mesher import mesh_view
 from common.body.rigged_mesh import DRAWN_EDGE_M, DRAWN_LINK_STEPS, MESH_STRIDE, build_rigged_mesh
 from common.body.skeleton import LINK_COUNT, LINK_INDEX, LINK_PARENTS
-from common.body.skinning import animate_rigid, link_motion
+from common.body.skinning import animate, link_motion
 from common.body.view import View
 from common.geometry.rigid_transform import transform_points
 from tests.capsule_person import SKELETON
@@ -123,7 +123,7 @@ def test_links_that_only_touch_are_not_drawn_joined() -> None:
 
 
 def test_drawn_triangles_do_not_stretch_far_when_the_arms_part_from_the_body() -> None:
-    moved = animate_rigid(MESH, link_motion(MESH, links_of(arms_down_by(0.5))))
+    moved = animate(MESH, link_motion(MESH, links_of(arms_down_by(0.5))), "rigid")
     edges = moved[MESH.faces_drawn] - moved[np.roll(MESH.faces_drawn, 1, axis=1)]
     hands = np.isin(MESH.vertex_link[MESH.faces_drawn], [LINK_INDEX["left_hand"], LINK_INDEX["left_fingers"]])
     assert np.linalg.norm(edges, axis=-1)[hands.any(axis=1)].max() < 0.12

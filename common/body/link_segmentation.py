@@ -22,11 +22,17 @@ def nearest_link(
     (beyond the end / cap)²; thickness is the radius and 2 cm of flesh, so that a thick torso reaches its own surface
     before a thin arm beside it does; the cap is at most 5 cm.
     """
+    return _nearest(vertices, *bone_metric(skeleton, T_world_link))
+
+
+def bone_metric(skeleton: Skeleton, T_world_link: NDArray[np.float32]) -> tuple[NDArray[np.float32], ...]:
+    """What distances to bones are measured by: starts (L, 3) [m, world], axes (L, 3), lengths (L,) [m], and one over
+    the squares of thickness and cap (L,), (L,) [m⁻²]."""
     starts, ends = bone_segments(skeleton, T_world_link)
     lengths = np.maximum(np.linalg.norm(ends - starts, axis=1), np.float32(1e-6))
     thickness = skeleton.radii + np.float32(FLESH_M)
     caps = np.minimum(thickness, np.float32(CAP_M))
-    return _nearest(vertices, starts, (ends - starts) / lengths[:, None], lengths, thickness**-2, caps**-2)
+    return starts, (ends - starts) / lengths[:, None], lengths, thickness**-2, caps**-2
 
 
 @njit(nogil=True, cache=True, error_model="numpy")

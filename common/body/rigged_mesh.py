@@ -16,6 +16,7 @@ from common.body.depth_mesher import mesh_view
 from common.body.link_segmentation import nearest_link
 from common.body.skeleton import LINK_COUNT, LINK_PARENTS, Skeleton
 from common.body.skeleton_pose import SkeletonPose, forward_kinematics
+from common.body.vertex_blend import VertexBlend, vertex_blend
 from common.body.view import View
 from common.geometry.rigid_transform import inverse
 from common.geometry.triangle_mesh import TriangleMesh
@@ -66,7 +67,8 @@ class JointEdges:
 class RiggedMesh:
     """A captured person, ready to be moved.
 
-    ``T_link_world`` (L, 4, 4) float64: world at capture → link frames. ``vertex_link`` (V,) uint8.
+    ``T_link_world`` (L, 4, 4) float64: world at capture → link frames. ``vertex_link`` (V,) uint8: its segment, which
+    σ goes by; ``blend``: its neighbour's part, for skinning.
     ``mesh.faces`` holds every triangle; ``faces_drawn`` (F', 3) int32 are its first F', whose edges were at most 6 cm
     at capture and join links at most two steps apart. The views stay separate surfaces in the one mesh.
     """
@@ -78,6 +80,7 @@ class RiggedMesh:
     T_link_world: NDArray[np.float64]
     mesh: TriangleMesh
     vertex_link: NDArray[np.uint8]
+    blend: VertexBlend
     faces_drawn: NDArray[np.int32]
     joint_edges: JointEdges
 
@@ -91,6 +94,9 @@ class RiggedMesh:
             self.mesh.uv,
             self.mesh.texture,
             self.vertex_link,
+            self.blend.other,
+            self.blend.share,
+            self.blend.joint,
             edges.vertices,
             edges.points,
         )
@@ -117,9 +123,9 @@ def build_rigged_mesh(
     if drawn_count == 0:
         raise ValueError(f"pose {pose_id}: nothing of its {len(mesh.faces)} triangles can be drawn")
     edges = joint_edges(mesh, vertex_link, T_link_world)
-    return RiggedMesh(
-        pose_id, capture_ns, skeleton, pose, T_link_world, mesh, vertex_link, mesh.faces[:drawn_count], edges
-    )
+    blend = vertex_blend(mesh.vertices, vertex_link, skeleton, T_world_link)
+    drawn = mesh.faces[:drawn_count]
+    return RiggedMesh(pose_id, capture_ns, skeleton, pose, T_link_world, mesh, vertex_link, blend, drawn, edges)
 
 
 def joint_edges(mesh: TriangleMesh, vertex_link: NDArray[np.uint8], T_link_world: NDArray[np.float64]) -> JointEdges:

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from common.body.skinning import Skinning
 from common.geometry.camera_model import Camera
 from common.geometry.rigid_transform import look_at
 from common.runtime.compute_worker import ComputeWorker
@@ -26,11 +27,11 @@ def front_camera() -> Camera:
 class HeadlessScreen:
     """A ``Viewer`` that renders what it is shown; ``frames_rendered`` counts. All methods are the loop's."""
 
-    def __init__(self, timer: StageTimer, camera: Camera | None = None) -> None:
+    def __init__(self, timer: StageTimer, camera: Camera | None = None, skinning: Skinning = "spherical") -> None:
         self.frames_rendered = 0
         self._camera = camera or front_camera()
         self._timer = timer
-        self._viewer = OffscreenViewer()
+        self._viewer = OffscreenViewer(skinning)
         self._rendered: ShownFrame | None = None
         self._renderer = ComputeWorker("render", self._render, self._on_rendered, background=True)
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from common.body.skinning import animate_rigid
+from common.body.skinning import Skinning, animate
 from common.geometry.camera_model import Camera
 from common.geometry.rasterizer import render
 from receiver.viewer.viewer import ShownFrame, ViewerStatus
@@ -26,7 +26,8 @@ class OffscreenViewer:
     there; ``status`` is the newest one.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, skinning: Skinning = "spherical") -> None:
+        self._skinning: Skinning = skinning
         self._poses: dict[int, RiggedMesh] = {}
         self._on_screen: tuple[ShownFrame, RiggedMesh] | None = None  # replaced whole, so that threads see both or none
         self.frames_shown = 0
@@ -68,7 +69,7 @@ class OffscreenViewer:
             return [_nobody(camera) for camera in cameras]
         frame, mesh = on_screen
         assert frame.motion is not None  # as its pose is not
-        vertices = animate_rigid(mesh, frame.motion)
+        vertices = animate(mesh, frame.motion, self._skinning)
         return [render(vertices, mesh.faces_drawn, mesh.mesh.surface, camera, BACKGROUND) for camera in cameras]
 
 

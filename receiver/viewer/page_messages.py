@@ -5,7 +5,8 @@ four bytes, so that the page reads typed arrays in place (``web/src/messages.js`
 
 - POSE, once per candidate pose: ``pose_id u32, vertices V u32, triangles F u32, box_min f32[3], box_size f32[3],
   position u16[V, 3]`` (0..65535 over the box), padding, ``uv u16[V, 2]`` (0..65535 over the texture, from its top left
-  corner), ``link u8[V]``, padding, ``index u16[F, 3]`` (u32 if V > 65,536), padding, and the texture as JPEG.
+  corner), ``link u8[V, 4]`` (its link, the neighbour that also moves it, the joint between them, the neighbour's part
+  in 1/255), ``joints f32[L, 3]`` at capture, ``index u16[F, 3]`` (u32 if V > 65,536), padding, and the texture as JPEG.
 - FRAME, every skeleton: ``pose_id u32, sequence u32, sigma f32, fit_confidence f32, age_ms f32, motion f32[L, 3, 4],
   joints f32[L, 3], confidence u8[L]``, padding: 1,432 bytes, 0.34 Mbit/s at 30 Hz.
 - REMOVE: ``pose_id u32``.
@@ -26,12 +27,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from common.body.skeleton import LINK_COUNT, LINK_PARENTS
+from common.body.skinning import Skinning, captured_joints
 from receiver.viewer.viewer import ShownFrame, ViewerStatus
 
 if TYPE_CHECKING:
     from common.body.rigged_mesh import RiggedMesh
 
-VERSION = 2
+VERSION = 3
 POSE, FRAME, REMOVE = 1, 2, 3
 NO_POSE = 0xFFFFFFFF
 QUANTIZATION_STEPS = 65535
@@ -66,7 +68,9 @@ def encode_pose(mesh: RiggedMesh) -> bytes:
     box_size = np.maximum(vertices.max(axis=0) - box_min, np.float32(1e-6))
     position = np.rint((vertices - box_min) * (QUANTIZATION_STEPS / box_size)).astype("<u2")
     index = faces.astype("<u2" if count <= SHORT_INDEX_VERTICES else "<u4")
-    parts = (position, np.rint(uv * QUANTIZATION_STEPS).astype("<u2"), mesh.vertex_link, index)
+    blend = mesh.blend
+    skin = np.stack([mesh.vertex_link, blend.other, blend.joint, blend.share], axis=1)
+    parts = (position, np.rint(uv * QUANTIZATION_STEPS).astype("<u2"), skin, captured_joints(mesh), index)
     head = _HEADER.pack(VERSION, POSE) + _POSE.pack(mesh.pose_id, count, len(faces), *box_min, *box_size)
     return b"".join((head, *(_padded(part.tobytes()) for part in parts), _jpeg(mesh.mesh.texture)))
 
@@ -92,9 +96,9 @@ def encode_status(status: ViewerStatus) -> str:
     return json.dumps({"kind": "status", **figures})
 
 
-def encode_hello() -> str:
-    """The first message to a page: protocol version and the link tree its overlay draws."""
-    return json.dumps({"kind": "hello", "version": VERSION, "link_parents": LINK_PARENTS})
+def encode_hello(skinning: Skinning) -> str:
+    """The first message to a page: protocol version, how meshes bend, and the link tree its overlay draws."""
+    return json.dumps({"kind": "hello", "version": VERSION, "skinning": skinning, "link_parents": LINK_PARENTS})
 
 
 def decode_acknowledgement(message: bytes) -> int:

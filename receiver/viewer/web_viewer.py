@@ -18,6 +18,7 @@ from urllib.parse import urlsplit
 
 from aiohttp import WSCloseCode, WSMsgType, web
 
+from common.body.skinning import Skinning
 from receiver.viewer.page_messages import (
     decode_acknowledgement,
     encode_frame,
@@ -53,14 +54,20 @@ class WebViewer:
     """A ``Viewer`` whose screens are browsers. All methods are called on the event loop.
 
     ``allowed_hosts``: names a browser may use for this server besides the loopback ones, as ``telepose.lan``.
+    ``skinning``: how meshes bend at their joints.
     """
 
     def __init__(
-        self, page_folder: Path = PAGE_FOLDER, allowed_hosts: Iterable[str] = (), heartbeat_s: float = HEARTBEAT_S
+        self,
+        page_folder: Path = PAGE_FOLDER,
+        allowed_hosts: Iterable[str] = (),
+        heartbeat_s: float = HEARTBEAT_S,
+        skinning: Skinning = "spherical",
     ) -> None:
         self._page_folder = page_folder
         self._allowed_hosts = LOOPBACK_HOSTS | frozenset(allowed_hosts)
         self._heartbeat_s = heartbeat_s
+        self._skinning: Skinning = skinning
         self._poses: dict[int, _HeldPose] = {}
         self._frame: bytes | None = None
         self._pose_on_screen: int | None = None
@@ -152,7 +159,7 @@ class WebViewer:
     async def _keep_up_to_date(self, page: _Page) -> None:
         """Sends the page what it lacks, for as long as it is there."""
         try:
-            await page.socket.send_str(encode_hello())
+            await page.socket.send_str(encode_hello(self._skinning))
             while True:
                 page.wake.clear()
                 if page.under_way >= MESSAGES_UNDER_WAY or not await self._send_difference(page):

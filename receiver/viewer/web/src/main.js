@@ -17,8 +17,9 @@ let capturedAt = NaN; // when what is on screen was captured, on this page's clo
 let drawnAt = performance.now();
 
 connect({
-  hello({ link_parents }) {
+  hello({ link_parents, skinning }) {
     person.clear(); // a new connection starts with an empty repository
+    person.skinning = skinning;
     skeleton.setLinks(link_parents);
   },
   status(status) {

@@ -1,6 +1,6 @@
 // The page's end of receiver/viewer/page_messages.py: typed arrays read in place, little-endian.
 
-export const VERSION = 2;
+export const VERSION = 3;
 const KINDS = { 1: decodePose, 2: decodeFrame, 3: decodeRemove };
 const NO_POSE = 0xffffffff;
 export const LINKS = 23;
@@ -17,8 +17,9 @@ function decodePose(buffer, view) {
   const faces = view.getUint32(12, true);
   const Index = vertices <= 65536 ? Uint16Array : Uint32Array;
   const uvOffset = 40 + align(vertices * 6);
-  const linkOffset = uvOffset + vertices * 4;
-  const indexOffset = linkOffset + align(vertices);
+  const skinOffset = uvOffset + vertices * 4;
+  const jointOffset = skinOffset + vertices * 4;
+  const indexOffset = jointOffset + LINKS * 12;
   const textureOffset = indexOffset + align(faces * 3 * Index.BYTES_PER_ELEMENT);
   return {
     kind: "pose",
@@ -27,7 +28,8 @@ function decodePose(buffer, view) {
     boxSize: new Float32Array(buffer, 28, 3),
     positions: new Uint16Array(buffer, 40, vertices * 3),
     uv: new Uint16Array(buffer, uvOffset, vertices * 2),
-    links: new Uint8Array(buffer, linkOffset, vertices),
+    skin: new Uint8Array(buffer, skinOffset, vertices * 4),
+    joints: new Float32Array(buffer, jointOffset, LINKS * 3),
     indices: new Index(buffer, indexOffset, faces * 3),
     jpeg: new Uint8Array(buffer, textureOffset),
   };

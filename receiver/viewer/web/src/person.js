@@ -1,21 +1,41 @@
-// The person: each candidate pose's mesh and texture are on the GPU once; a frame moves it by one rigid motion per link.
+// The person: each candidate pose's mesh and texture are on the GPU once; a frame moves it by one rigid motion per link,
+// mixed at the joints as common/body/skinning.py does.
 
 import * as THREE from "three";
 import { LINKS } from "./messages.js";
 
+const SKINNINGS = ["rigid", "linear", "spherical"];
+
 const vertexShader = /* glsl */ `
   uniform vec3 boxMin;
   uniform vec3 boxSize;
+  uniform int skinning;
   uniform vec4 motion[${3 * LINKS}];  // the rows of a 3x4 matrix per link
-  in float link;
+  uniform vec4 turn[${LINKS}];  // its rotation as a quaternion (x, y, z, w)
+  uniform vec3 joint[${LINKS}];  // at capture
+  in vec4 skin;  // link, neighbour, joint between them, the neighbour's part in 1/255
   out vec2 at;
 
+  vec3 moved(int link, vec3 point) {
+    vec4 p = vec4(point, 1.0);
+    return vec3(dot(motion[3 * link], p), dot(motion[3 * link + 1], p), dot(motion[3 * link + 2], p));
+  }
+
+  vec3 now(vec3 captured) {
+    int link = int(skin.x + 0.5), other = int(skin.y + 0.5);
+    float share = skin.w / 255.0;
+    if (skinning == 0 || share == 0.0) return moved(link, captured);
+    if (skinning == 1) return mix(moved(link, captured), moved(other, captured), share);
+    vec3 pivot = joint[int(skin.z + 0.5)];
+    vec4 q = (1.0 - share) * turn[link] + (dot(turn[link], turn[other]) < 0.0 ? -share : share) * turn[other];
+    vec3 arm = captured - pivot;
+    arm += 2.0 / dot(q, q) * cross(q.xyz, cross(q.xyz, arm) + q.w * arm);
+    return mix(moved(link, pivot), moved(other, pivot), share) + arm;
+  }
+
   void main() {
-    vec4 captured = vec4(boxMin + boxSize * position, 1.0);
-    int row = 3 * int(link + 0.5);
-    vec3 now = vec3(dot(motion[row], captured), dot(motion[row + 1], captured), dot(motion[row + 2], captured));
     at = uv;
-    gl_Position = projectionMatrix * viewMatrix * vec4(now, 1.0);
+    gl_Position = projectionMatrix * viewMatrix * vec4(now(boxMin + boxSize * position), 1.0);
   }`;
 
 // Unlit: the cameras' colours already hold the light of the room.
@@ -38,7 +58,9 @@ export class Person {
     this.meshes = new Map(); // of all poses; those in the group can be shown
     this.frame = null; // the last one to show
     this.shared = {
+      skinning: { value: 0 },
       motion: { value: new Float32Array(12 * LINKS) },
+      turn: { value: Array.from({ length: LINKS }, () => new THREE.Quaternion()) },
       presence: { value: 1 },
     };
   }
@@ -77,7 +99,13 @@ export class Person {
     this.frame = frame;
     if (poseId !== null && !this.meshes.get(poseId)?.parent) return;
     this.shared.motion.value.set(motion);
+    this.shared.turn.value.forEach((turn, link) => turn.setFromRotationMatrix(matrixOf(motion, link)));
     for (const [id, mesh] of this.meshes) mesh.visible = id === poseId;
+  }
+
+  /** How the mesh bends at its joints: "rigid", "linear" or "spherical". */
+  set skinning(name) {
+    this.shared.skinning.value = SKINNINGS.indexOf(name);
   }
 
   /** 1 = live, 0 = grey: the picture is old. */
@@ -86,11 +114,11 @@ export class Person {
   }
 }
 
-function meshOf({ boxMin, boxSize, positions, uv, links, indices }, shared) {
+function meshOf({ boxMin, boxSize, positions, uv, skin, joints, indices }, shared) {
   const geometry = new THREE.BufferGeometry();
   geometry.setAttribute("position", onGpuOnly(new THREE.BufferAttribute(positions, 3, true)));
   geometry.setAttribute("uv", onGpuOnly(new THREE.BufferAttribute(uv, 2, true)));
-  geometry.setAttribute("link", onGpuOnly(new THREE.BufferAttribute(links, 1)));
+  geometry.setAttribute("skin", onGpuOnly(new THREE.BufferAttribute(skin, 4)));
   geometry.setIndex(onGpuOnly(new THREE.BufferAttribute(indices, 1)));
   geometry.boundingSphere = new THREE.Sphere(); // else three.js reads every vertex, to sort one mesh
   const material = new THREE.ShaderMaterial({
@@ -102,12 +130,21 @@ function meshOf({ boxMin, boxSize, positions, uv, links, indices }, shared) {
       atlas: { value: null },
       boxMin: { value: new THREE.Vector3(...boxMin) },
       boxSize: { value: new THREE.Vector3(...boxSize) },
+      joint: { value: joints.slice() },
     },
   });
   const mesh = new THREE.Mesh(geometry, material);
   mesh.frustumCulled = false; // its bounds are those of the capture, not of now
   mesh.visible = false;
   return mesh;
+}
+
+const matrix = new THREE.Matrix4();
+
+/** A link's motion, three rows of four, as three.js' matrix; used until the next call. */
+function matrixOf(motion, link) {
+  const [a, b, c, d, e, f, g, h, i, j, k, l] = motion.subarray(12 * link, 12 * link + 12);
+  return matrix.set(a, b, c, d, e, f, g, h, i, j, k, l, 0, 0, 0, 1);
 }
 
 /** Colours go to the screen as they were sent: no colour space, no mip-maps. */

@@ -19,6 +19,7 @@ export class Stage {
     this.shadow = softShadow();
     this.scene.add(this.shadow);
     this.camera = new THREE.PerspectiveCamera(32, 1, 0.1, 60);
+    canvas.camera = this.camera; // for whoever compares the picture with another renderer's
     this.controls = new OrbitControls(this.camera, canvas);
     this.controls.enablePan = false; // the camera follows the person by itself
     this.controls.minDistance = 0.8;
