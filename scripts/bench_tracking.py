@@ -14,14 +14,14 @@ import sys
 from collections.abc import Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import ExitStack
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from scripts.run_bench import Row
 from scripts.tracking_conditions import condition, performer_for, sights
-from scripts.tracking_run import flips_of, follow, is_clean
+from scripts.tracking_figures import save_all
+from scripts.tracking_run import Case, Result, flips_of, follow, is_clean
 from sender.fitting.open_tracker import TRACKERS, open_tracker
 
 DEFAULT_CONDITIONS = (
@@ -38,48 +38,23 @@ _REFERENCES = {
 }
 
 
-@dataclass(frozen=True, slots=True)
-class Case:
-    """One film and the tracker that follows it."""
-
-    tracker: str
-    body: str
-    clip: str
-    condition: str
-    data: Path | None
-    seconds: float | None
-
-    @property
-    def name(self) -> str:
-        return f"{self.tracker}/{self.body}/{self.clip}/{self.condition}"
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Result:
-    """A case's figures, ``flipped`` of ``frames`` in its truth, and the error over time for pictures."""
-
-    case: Case
-    metrics: dict[str, float]
-    flipped: int
-    frames: int
-    times_s: list[float]
-    e_t: list[float]
-
-
 def add_options(parser: argparse.ArgumentParser) -> None:
     """This bench's own options."""
     parser.add_argument("--trackers", default="gauss-newton", help=f"of {', '.join(TRACKERS)}, separated by commas")
     parser.add_argument("--conditions", default=DEFAULT_CONDITIONS, help="separated by commas")
     parser.add_argument("--bodies", default="", help="only these, separated by commas")
     parser.add_argument("--jobs", type=int, default=1, help="cases at a time, each in a process; times are noisy then")
+    parser.add_argument("--pictures", type=Path, help="folder for error curves and overlays")
 
 
 def run(
     data: Path | None, seconds: float | None, clips: tuple[str, ...], trackers: str, conditions: str, bodies: str,
-    jobs: int,
+    jobs: int, pictures: Path | None = None,
 ) -> Iterator[Row]:  # fmt: skip
     """Rows of every case as it is done, then the means; progress on stderr."""
     cases = list(_cases(data, seconds, clips, _names(trackers), _names(conditions), _names(bodies)))
+    if not cases or jobs < 1:
+        raise SystemExit("nothing to measure" if not cases else "--jobs must be positive")
     results = []
     with ExitStack() as stack:
         for result in _measured(cases, jobs, stack):
@@ -87,10 +62,13 @@ def run(
             print(f"{len(results)}/{len(cases)} {_summary(result)}", file=sys.stderr, flush=True)
             yield from _rows(result, jobs)
     yield from means(results)
+    if pictures is not None:
+        save_all(results, open_tracker(cases[0].tracker), pictures)
 
 
 def means(results: Iterable[Result]) -> Iterator[Row]:
-    """Rows for every tracker and condition over the clean clips and over the others: means, but of maxima the largest.
+    """Rows for every tracker and condition over the clean clips and over the others: means, but the largest of e_t_max
+    and time_to_skeleton_s.
 
     A case without any skeleton counts in ``lost_share``, it has no e_t.
     """
@@ -100,9 +78,12 @@ def means(results: Iterable[Result]) -> Iterator[Row]:
         groups.setdefault((result.case.tracker, kind, result.case.condition), []).append(result)
     for (tracker, kind, seen), members in groups.items():
         for metric in _metrics_of(members):
-            values = [member.metrics[metric] for member in members if metric in member.metrics]
-            value = max(values) if metric == "e_t_max" else float(np.mean(values))
-            yield _row(f"{tracker}/all/{kind}/{seen}", metric, value, f"{len(values)} cases")
+            values = {m.case: m.metrics[metric] for m in members if metric in m.metrics}
+            worst = max(values, key=lambda case: values[case])
+            largest = metric in ("e_t_max", "time_to_skeleton_s")
+            value = values[worst] if largest else float(np.mean(list(values.values())))
+            remark = f"{len(values)} cases, largest {values[worst]:.4g} in {worst.body}/{worst.clip}"
+            yield _row(f"{tracker}/all/{kind}/{seen}", metric, value, remark)
 
 
 def _metrics_of(results: list[Result]) -> list[str]:

@@ -11,6 +11,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterable
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -31,6 +32,34 @@ LOST_E_T = 0.05
 FLIP_RATE_HZ = 60.0  # frames a second of motion capture in which flips are looked for
 FLIP_RAD = np.deg2rad(24.0)  # 1,440° a second: the fastest throws reach that; retarget slows source flips down to 25°
 CLEAN_SHARE = 0.02  # a clip whose joints flip in fewer of its frames is clean
+
+
+@dataclass(frozen=True, slots=True)
+class Case:
+    """One film and the tracker that follows it."""
+
+    tracker: str
+    body: str
+    clip: str
+    condition: str
+    data: Path | None
+    seconds: float | None
+
+    @property
+    def name(self) -> str:
+        return f"{self.tracker}/{self.body}/{self.clip}/{self.condition}"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Result:
+    """A case's figures, ``flipped`` of ``frames`` in its truth, and the error over time for pictures."""
+
+    case: Case
+    metrics: dict[str, float]
+    flipped: int
+    frames: int
+    times_s: list[float]
+    e_t: list[float]
 
 
 @dataclass

@@ -13,7 +13,7 @@ from common.body.skeleton import NAMED_JOINT_LINKS
 from common.body.skeleton_pose import SkeletonPose, forward_kinematics, rest_pose
 from common.geometry import quaternion
 from common.geometry.point_cloud import PointCloud
-from scripts.bench_tracking import Case, Result, means
+from scripts.bench_tracking import means
 from scripts.run_bench import Row, kept
 from scripts.tracking_conditions import (
     Sight,
@@ -23,7 +23,7 @@ from scripts.tracking_conditions import (
     sights,
     surface_points,
 )
-from scripts.tracking_run import FLIP_RATE_HZ, Run, flips, is_clean
+from scripts.tracking_run import FLIP_RATE_HZ, Case, Result, Run, flips, is_clean
 from sender.fitting.tracker import FitResult
 from tests.capsule_person import SKELETON, pose_at
 
