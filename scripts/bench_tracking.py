@@ -61,12 +61,12 @@ def run(
             results.append(result)
             print(f"{len(results)}/{len(cases)} {_summary(result)}", file=sys.stderr, flush=True)
             yield from _rows(result, jobs)
-    yield from means(results)
+    yield from means(results, jobs)
     if pictures is not None:
         save_all(results, open_tracker(cases[0].tracker), pictures)
 
 
-def means(results: Iterable[Result]) -> Iterator[Row]:
+def means(results: Iterable[Result], jobs: int = 1) -> Iterator[Row]:
     """Rows for every tracker and condition over the clean clips and over the others: means, but the largest of e_t_max
     and time_to_skeleton_s.
 
@@ -83,7 +83,7 @@ def means(results: Iterable[Result]) -> Iterator[Row]:
             largest = metric in ("e_t_max", "time_to_skeleton_s")
             value = values[worst] if largest else float(np.mean(list(values.values())))
             remark = f"{len(values)} cases, largest {values[worst]:.4g} in {worst.body}/{worst.clip}"
-            yield _row(f"{tracker}/all/{kind}/{seen}", metric, value, remark)
+            yield _row(f"{tracker}/all/{kind}/{seen}", metric, value, remark, *_noisy(metric, jobs))
 
 
 def _metrics_of(results: list[Result]) -> list[str]:
@@ -163,13 +163,16 @@ def _summary(result: Result) -> str:
 def _rows(result: Result, jobs: int) -> Iterator[Row]:
     for metric, value in result.metrics.items():
         remarks = [f"glitches: {result.flipped} of {result.frames} frames"] if result.flipped else []
-        if jobs > 1 and metric.startswith("ms_"):
-            remarks.append(f"{jobs} cases at a time: noisy")
-        yield _row(result.case.name, metric, value, "; ".join(remarks))
+        yield _row(result.case.name, metric, value, *remarks, *_noisy(metric, jobs))
 
 
-def _row(case: str, metric: str, value: float, remark: str) -> Row:
+def _noisy(metric: str, jobs: int) -> list[str]:
+    """What is to be said of times taken while other cases ran."""
+    return [f"{jobs} cases at a time: noisy"] if jobs > 1 and metric.startswith("ms_") else []
+
+
+def _row(case: str, metric: str, value: float, *remarks: str) -> Row:
     reference, source = _REFERENCES.get(metric, (None, "")) if case.endswith("/points-given") else (None, "")
     unit = _UNITS.get(metric, "R")
-    joined = "; ".join(part for part in (source, remark) if part)
+    joined = "; ".join(part for part in (source, *remarks) if part)
     return {"case": case, "metric": metric, "value": value, "unit": unit, "reference": reference, "source": joined}
