@@ -48,7 +48,7 @@ class CaptureSettings:
 class TrackingSettings:
     """``tracker``: by name. ``points``: how many points of each frame's cloud it is given."""
 
-    tracker: Literal["gauss-newton"] = "gauss-newton"
+    tracker: Literal["gauss-newton", "articp"] = "gauss-newton"
     points: int = 2500
 
     def __post_init__(self) -> None:

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+from sender.fitting.articp_tracker import ArticpSettings, ArticpTracker
 from sender.fitting.body_model import BodyModel
 from sender.fitting.gauss_newton_tracker import GaussNewtonSettings, GaussNewtonTracker
 from sender.fitting.tracker import Tracker
 
 TRACKERS: dict[str, Callable[[BodyModel | None], Tracker]] = {
     "gauss-newton": lambda body: GaussNewtonTracker(GaussNewtonSettings(), body),
+    "articp": lambda _: ArticpTracker(ArticpSettings()),
 }
 
 
