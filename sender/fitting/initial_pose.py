@@ -64,11 +64,12 @@ class NoPose:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Outline:
+class Outline:
     """What the cloud says before any fit. ``floor_y``, ``stature_m`` [m]; ``middle`` (2,): x, z of the trunk [m];
     ``headings``: facings to try [rad about y]; ``person`` (N,): points that can belong to the person."""
 
     floor_y: float
+    top: float
     stature_m: float
     whole_body: bool
     middle: Floats
@@ -86,15 +87,15 @@ def find_initial_pose(cloud: PointCloud, floor_y: float | None = None) -> Initia
     if len(cloud) < MINIMUM_POINTS:
         return NoPose(f"{len(cloud)} points, at least {MINIMUM_POINTS} are needed")
     points, normals = cloud.positions.astype(np.float64), cloud.normals.astype(np.float64)
-    outline = _outline(points, normals, floor_y)
+    outline = outline_of(points, normals, floor_y)
     if isinstance(outline, NoPose):
         return outline
     template = human_template()
     fit = _best_fit(template, points[outline.person], normals[outline.person], outline)
-    return _judged(template, fit, outline, len(cloud))
+    return judged(template, fit, outline, len(cloud))
 
 
-def _outline(points: Floats, normals: Floats, floor_y: float | None) -> _Outline | NoPose:
+def outline_of(points: Floats, normals: Floats, floor_y: float | None) -> Outline | NoPose:
     heights = np.sort(points[:, 1])
     top, bottom = float(heights[-3]) + EDGE_M, float(heights[2]) - EDGE_M
     if not 0.3 < top - bottom < 2.4:
@@ -114,10 +115,10 @@ def _outline(points: Floats, normals: Floats, floor_y: float | None) -> _Outline
     across = directions[:, 1]  # the widest: shoulders and arms
     heading = float(np.arctan2(-across[1], across[0]))  # the left, +x, of a person of heading 0 turned there
     middle = np.median(trunk, axis=0) - 0.05 * stature * camera_side
-    return _Outline(floor, stature, True, middle, (heading, heading + np.pi), np.ones(len(points), np.bool_))
+    return Outline(floor, top, stature, True, middle, (heading, heading + np.pi), np.ones(len(points), np.bool_))
 
 
-def _upper_body_outline(points: Floats, normals: Floats, top: float, camera_side: Floats) -> _Outline | NoPose:
+def _upper_body_outline(points: Floats, normals: Floats, top: float, camera_side: Floats) -> Outline | NoPose:
     """An upper body hangs from its head; what is out of its arms' reach, or level like a table, is not the person."""
     head = points[points[:, 1] > top - 0.15 * AVERAGE_STATURE_M][:, [0, 2]]
     middle = np.median(head, axis=0) - 0.04 * AVERAGE_STATURE_M * camera_side
@@ -133,10 +134,10 @@ def _upper_body_outline(points: Floats, normals: Floats, top: float, camera_side
     if np.linalg.norm(reach) > 0.007 * AVERAGE_STATURE_M * len(points):
         facing, turns_deg = reach, (-30.0, -10.0, 10.0, 30.0)  # arms reach forwards, whichever side the camera sees
     headings = tuple(float(np.arctan2(facing[0], facing[1]) + np.deg2rad(turn)) for turn in turns_deg)
-    return _Outline(top - AVERAGE_STATURE_M, AVERAGE_STATURE_M, False, middle, headings, person)
+    return Outline(top - AVERAGE_STATURE_M, top, AVERAGE_STATURE_M, False, middle, headings, person)
 
 
-def _starts(template: Template, outline: _Outline) -> list[TemplateFit]:
+def _starts(template: Template, outline: Outline) -> list[TemplateFit]:
     """People standing straight, in each facing and with each angle of the arms."""
     starts = []
     for heading in outline.headings:
@@ -152,7 +153,7 @@ def _starts(template: Template, outline: _Outline) -> list[TemplateFit]:
     return starts
 
 
-def _best_fit(template: Template, points: Floats, normals: Floats, outline: _Outline) -> TemplateFit:
+def _best_fit(template: Template, points: Floats, normals: Floats, outline: Outline) -> TemplateFit:
     """Coarse fits from all starts, then fine ones of the cheapest of each facing: few points do not tell front from
     back. The cheapest of those."""
     used = np.ones(len(template.cone_links), np.bool_) if outline.whole_body else ~template.leg_cones
@@ -174,7 +175,7 @@ def _best_fit(template: Template, points: Floats, normals: Floats, outline: _Out
     return refined(kept, FINE_POINTS, FINE_ITERATIONS, FINE_GATES_M)[0]
 
 
-def _judged(template: Template, fit: TemplateFit, outline: _Outline, cloud_points: int) -> InitialPose | NoPose:
+def judged(template: Template, fit: TemplateFit, outline: Outline, cloud_points: int) -> InitialPose | NoPose:
     near = (fit.cone >= 0) & (np.abs(fit.distance_m) < INLIER_M)
     quality = float(near.mean() * outline.person.sum() / cloud_points)
     if near.mean() < LEAST_INLIERS:

@@ -12,10 +12,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from common.body.skeleton import LINK_COUNT
 from sender.fitting.body_template import Template
 from sender.fitting.template_kernels import add_extents, add_floor, add_points, jacobian, match
 
 _POINT_SIGMA_M = 0.015  # spread of a point about a cone of the right size: clothes and bodies are not cones
+SURFACE_M = 0.035  # points nearer than this lie on the surface
+UNSEEN_WEIGHT = 0.5  # of surface without points against points without surface: it may be hidden
+_FEW = 0.3  # of the points that an evenly covered link would hold
 _EFFECTIVE_POINTS = 400  # neighbouring points err together, so more points do not outweigh the priors
 
 
@@ -24,7 +28,9 @@ class TemplateFit:
     """Where a fit ended, or a start to fit from. ``theta`` (P,): sizes, root position, angles; ``prior`` (P,): where
     their priors are centred; ``heading`` [rad about y]; ``cone`` (N,) int: each point's cone, -1 = none;
     ``distance_m`` (N,): signed distance to it; ``cost``: half the sum of robust squared residuals and priors, each
-    over its variance, by which fits of the same points compare."""
+    over its variance, by which fits of the same points compare; surface that no point lies on costs as much as points
+    off the surface (a score of points alone is best for a body with its limbs folded into the trunk).
+    ``unseen_share``: of the surface, 0..1."""
 
     theta: NDArray[np.float64]
     prior: NDArray[np.float64]
@@ -32,11 +38,14 @@ class TemplateFit:
     cone: NDArray[np.int64]
     distance_m: NDArray[np.float64]
     cost: float
+    unseen_share: float
 
 
-def unfitted(start: NDArray[np.float64], heading: float) -> TemplateFit:
+def unfitted(
+    start: NDArray[np.float64], heading: float, prior: NDArray[np.float64] | None = None
+) -> TemplateFit:
     """Parameters ``start`` (P,) and ``heading`` [rad about y] to fit from, and around which the priors are centred."""
-    return TemplateFit(start, start, heading, np.empty(0, np.int64), np.empty(0), np.inf)
+    return TemplateFit(start, start if prior is None else prior, heading, np.empty(0, np.int64), np.empty(0), np.inf, 1.0)
 
 
 def fit_template(
@@ -82,5 +91,24 @@ def fit_template(
         theta[:root] = np.clip(theta[:root], 0.5 * template.prior[:root], 1.6 * template.prior[:root])
         theta[template.lower_bounded] = np.maximum(theta[template.lower_bounded], -0.05)
         theta[template.upper_bounded] = np.minimum(theta[template.upper_bounded], 0.05)
-    cost = 0.5 * total * (scale_m / point_sigma_m) ** 2 + 0.5 * float(precision @ (theta - prior) ** 2)
-    return TemplateFit(theta, prior, heading, cone, distance, cost)
+    near = cone[(cone >= 0) & (np.abs(distance) < SURFACE_M)]
+    unseen_share = _unseen_share(template, ends, radii, used, near)
+    missed = (total + UNSEEN_WEIGHT * N * unseen_share) * (scale_m / point_sigma_m) ** 2
+    cost = 0.5 * missed + 0.5 * float(precision @ (theta - prior) ** 2)
+    return TemplateFit(theta, prior, heading, cone, distance, cost, unseen_share)
+
+
+def _unseen_share(
+    template: Template,
+    ends: NDArray[np.float64],
+    radii: NDArray[np.float64],
+    used: NDArray[np.bool_],
+    near: NDArray[np.int64],
+) -> float:
+    """Share of the used cones' side area on links that hold clearly fewer points than their area promises."""
+    sides = np.pi * radii.sum(axis=1) * np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1) * used
+    links = template.cone_links
+    areas = np.bincount(links, sides, LINK_COUNT) / sides.sum()
+    counts = np.bincount(links[near], minlength=LINK_COUNT)
+    expected = np.maximum(_FEW * areas * len(near), 1e-9)
+    return float(areas @ np.maximum(1.0 - counts / expected, 0.0))

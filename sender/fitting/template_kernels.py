@@ -67,20 +67,50 @@ def place(theta, heading, tables, root, vectors, rotations, origins, ends, radii
 
 @njit(nogil=True, cache=True, error_model="numpy")
 def jacobian(theta, heading, tables, root, ends, radii, d_ends, d_radii):  # type: ignore[no-untyped-def]
-    """Cones at θ and their derivatives by every parameter, as difference quotients."""
-    L = len(tables[0])
+    """Cones at θ and their derivatives by every parameter: sizes as difference quotients, the root's position, and
+    angles as the turn of everything below the joint."""
+    parents, cone_links, angle_links, angle_axes = tables[0], tables[7], tables[8], tables[9]
+    L = len(parents)
     vectors, rotations, origins = np.zeros((L, 3)), np.empty((L, 3, 3)), np.empty((L, 3))
-    place(theta, heading, tables, root, vectors, rotations, origins, ends, radii)
     moved = theta.copy()
-    for p in range(len(theta)):
+    for p in range(root):
         moved[p] = theta[p] + _STEP
         place(moved, heading, tables, root, vectors, rotations, origins, d_ends[p], d_radii[p])
         moved[p] = theta[p]
-        for k in range(len(ends)):
+    place(theta, heading, tables, root, vectors, rotations, origins, ends, radii)
+    for p in range(root):
+        d_ends[p] = (d_ends[p] - ends) / _STEP
+        d_radii[p] = (d_radii[p] - radii) / _STEP
+    d_ends[root:] = 0.0
+    d_radii[root:] = 0.0
+    for axis in range(3):
+        d_ends[root + axis, :, :, axis] = 1.0
+    below, spin = np.empty(L, np.bool_), np.empty((3, 3))
+    for a in range(len(angle_links)):
+        link = angle_links[a]
+        _spin(vectors[link], angle_axes[a], rotations[link], spin)
+        for other in range(L):
+            below[other] = other == link or (other > link and below[parents[other]])
+        for k in range(len(cone_links)):
+            if not below[cone_links[k]]:
+                continue
             for end in range(2):
-                d_radii[p, k, end] = (d_radii[p, k, end] - radii[k, end]) / _STEP
-                for axis in range(3):
-                    d_ends[p, k, end, axis] = (d_ends[p, k, end, axis] - ends[k, end, axis]) / _STEP
+                for row in range(3):
+                    for column in range(3):
+                        arm = ends[k, end, column] - origins[link, column]
+                        d_ends[root + 3 + a, k, end, row] += spin[row, column] * arm
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _spin(vector, axis, rotation, spin):  # type: ignore[no-untyped-def]
+    """``spin`` (3, 3): by how much the world rotation (3, 3) of a link turns per radian of its ``vector[axis]``."""
+    identity, before, after = np.eye(3), np.empty((3, 3)), np.empty((3, 3))
+    moved = vector.copy()
+    moved[axis] += _STEP
+    _turn(identity, vector[0], vector[1], vector[2], before)
+    _turn(identity, moved[0], moved[1], moved[2], after)
+    local = (before.T @ after - identity) / _STEP  # in the link's own frame
+    spin[:] = rotation @ local @ rotation.T
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
@@ -101,7 +131,11 @@ def match(points, normals, ends, radii, used, cone, along, distance, outward):  
             t = (px * bx + py * by + pz * bz) / (bx * bx + by * by + bz * bz)
             t = min(max(t, 0.0), 1.0)
             px, py, pz = px - t * bx, py - t * by, pz - t * bz
-            length = np.sqrt(px * px + py * py + pz * pz) + 1e-9
+            square = px * px + py * py + pz * pz
+            reach = best + max(radii[k, 0], radii[k, 1])
+            if square > reach * reach:
+                continue
+            length = np.sqrt(square) + 1e-9
             facing = (px * normals[i, 0] + py * normals[i, 1] + pz * normals[i, 2]) / length
             if facing < 0.0:
                 continue
@@ -127,9 +161,9 @@ def _add_row(row, residual, weight, H, g):  # type: ignore[no-untyped-def]
 @njit(nogil=True, cache=True, error_model="numpy")
 def add_points(cone, along, distance, outward, d_ends, d_radii, scale_m, sigma_m, H, g):  # type: ignore[no-untyped-def]
     """Add the points' rows to H (P, P) and g (P,); return their summed Geman–McClure cost d²/(d² + scale²)."""
-    P = len(g)
-    row = np.empty(P)
-    nonzero = np.empty(P, np.int64)
+    P, K = len(g), len(d_radii[0])
+    squares, sums = np.zeros((K, 8, 8)), np.zeros((K, 8))  # a row is a cone's derivatives times 8 numbers of the point
+    numbers = np.empty(8)
     total = 0.0
     for i in range(len(cone)):
         k = cone[i]
@@ -141,21 +175,54 @@ def add_points(cone, along, distance, outward, d_ends, d_radii, scale_m, sigma_m
         total += 1.0 - ratio
         weight = ratio * ratio / (sigma_m * sigma_m)
         t = along[i]
-        count = 0
-        for p in range(P):
-            value = -(1.0 - t) * d_radii[p, k, 0] - t * d_radii[p, k, 1]
-            for axis in range(3):
-                value -= outward[i, axis] * ((1.0 - t) * d_ends[p, k, 0, axis] + t * d_ends[p, k, 1, axis])
-            if value != 0.0:
-                row[count] = value
-                nonzero[count] = p
-                count += 1
-        for a in range(count):
-            p = nonzero[a]
-            g[p] += weight * row[a] * distance[i]
+        for axis in range(3):
+            numbers[axis] = -(1.0 - t) * outward[i, axis]
+            numbers[3 + axis] = -t * outward[i, axis]
+        numbers[6], numbers[7] = t - 1.0, -t
+        for a in range(8):
+            sums[k, a] += weight * numbers[a] * distance[i]
             for b in range(a + 1):
-                H[p, nonzero[b]] += weight * row[a] * row[b]
+                squares[k, a, b] += weight * numbers[a] * numbers[b]
+    D, nonzero, product = np.empty((P, 8)), np.empty(P, np.int64), np.empty(8)
+    for k in range(K):
+        if squares[k, 6, 6] + squares[k, 7, 7] == 0.0:
+            continue
+        for a in range(8):
+            for b in range(a):
+                squares[k, b, a] = squares[k, a, b]
+        count = _cone_derivatives(d_ends, d_radii, k, D, nonzero)
+        for a in range(count):
+            slope = 0.0
+            for c in range(8):
+                slope += D[a, c] * sums[k, c]
+                product[c] = 0.0
+                for d in range(8):
+                    product[c] += D[a, d] * squares[k, d, c]
+            g[nonzero[a]] += slope
+            for b in range(a + 1):
+                value = 0.0
+                for c in range(8):
+                    value += product[c] * D[b, c]
+                H[nonzero[a], nonzero[b]] += value
     return total
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _cone_derivatives(d_ends, d_radii, k, D, nonzero):  # type: ignore[no-untyped-def]
+    """Derivatives of cone ``k`` by the parameters that move it: rows of D (P, 8), their indices, and how many."""
+    count = 0
+    for p in range(len(D)):
+        moves = False
+        for end in range(2):
+            D[count, 6 + end] = d_radii[p, k, end]
+            moves |= d_radii[p, k, end] != 0.0
+            for axis in range(3):
+                D[count, 3 * end + axis] = d_ends[p, k, end, axis]
+                moves |= d_ends[p, k, end, axis] != 0.0
+        if moves:
+            nonzero[count] = p
+            count += 1
+    return count
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
