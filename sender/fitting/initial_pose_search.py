@@ -1,118 +1,124 @@
-"""The automatic start from a person who does as they like: hypotheses carried on over frames until one is certain.
+"""The automatic start from a person who does as they like: fits carried on over frames until one is certain.
 
 Every frame the human template is fitted from a few new starts (headings × typical poses) and from the best fits of the
-frames before. Fits that face opposite ways are two sides; each frame adds how much better the better side explains the
-cloud, and there is a start when one body explains nearly all of the cloud, nearly all of its own surface is seen, and
-the sides are told apart (a sequential test; Wald 1945).
+frame before. Fits that face opposite ways are two sides; every frame adds how much better one of them explains the
+cloud (knees, feet and elbows bend one way only) and how far the person went forwards. There is a start when one body
+explains nearly all of the cloud, nearly all of its surface is seen and the sides are told apart (a sequential test,
+Wald 1945); a T- or A-pose passes at once. Less is asked for as time passes, to a limit.
 """
 
 from __future__ import annotations
-
-from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from common.geometry.point_cloud import PointCloud
-from sender.fitting.body_template import ROOT, Template, human_template
-from sender.fitting.initial_pose import EDGE_M, InitialPose, NoPose, Outline, judged, outline_of
-from sender.fitting.start_poses import StartPoses
-from sender.fitting.template_fit import SURFACE_M, TemplateFit, fit_template, unfitted
+from sender.fitting.body_outline import NoPose, Outline, outline_of
+from sender.fitting.body_template import ROOT, human_template
+from sender.fitting.initial_pose import InitialPose, by_side, facing_rad, fitted, inlier_share, judged
+from sender.fitting.start_poses import first_starts, later_starts
+from sender.fitting.template_fit import TemplateFit, unfitted
 
 Floats = NDArray[np.float64]
 
-COARSE_POINTS, COARSE_ITERATIONS, COARSE_GATES_M = 300, 9, (0.20, 0.05)
-CARRIED_ITERATIONS, CARRIED_GATES_M = 9, (0.12, 0.04)
-FINE_POINTS, FINE_ITERATIONS, FINE_GATES_M = 900, 8, (0.06, 0.03)
 KEPT = 2  # fits of each side carried to the next frame
-MEMORY = 0.9  # of the evidence, per frame
+PATIENCE_S = 1.5  # until the least is asked for
+INLIERS = (0.90, 0.85)  # of the cloud, on the first frame and after PATIENCE_S
+COST = (160.0, 240.0)  # robust, per 400 points (template_fit)
+EVIDENCE = (60.0, 40.0)  # of one side against the other, in units of cost
+UNSEEN_SHARE = 0.15  # of the body's surface
+UPRIGHT_RAD = 1.0
+MEMORY_S = 1.0  # evidence fades: early frames may have had no fit near the truth
+INDEPENDENT_S = 0.1  # frames closer in time say the same thing
+WALKED_COST_PER_M = 100.0
+STEADY_S, STEADY_M, STEADY_SHARE = 0.4, 0.06, 0.15  # an upper body neither grows nor rises: nobody is coming in
 
 
 class InitialPoseSearch:
-    """``step`` is called with each cloud until it returns a pose."""
+    """``step`` is called with each cloud until it returns a pose. ``floor_y`` [m]: height of the floor, when known."""
 
     def __init__(self, floor_y: float | None = None) -> None:
         self._floor_y = floor_y
         self._template = human_template()
-        self._starts = StartPoses(self._template)
+        self._forget()
+
+    def _forget(self) -> None:
         self._sides: tuple[list[TemplateFit], list[TemplateFit]] = ([], [])
         self._evidence = 0.0  # for the first side
-        self.debug = []
+        self._frame = 0
+        self._times_ns = (0, 0)  # of the first frame and of the last one
+        self._steady: tuple[int, float, int] | None = None  # upper body: since when [ns], its top [m], its points
 
     def step(self, cloud: PointCloud, capture_ns: int) -> InitialPose | NoPose:
+        """The start pose in ``cloud`` (N points, world, y up) of ``capture_ns``, or why there is none yet."""
         points, normals = cloud.positions.astype(np.float64), cloud.normals.astype(np.float64)
         outline = outline_of(points, normals, self._floor_y)
         if isinstance(outline, NoPose):
+            self._forget()
             return outline
-        fits = self._fitted(points, normals, outline)
-        self._divide(fits)
-        return self._decided(outline, len(cloud))
+        if not outline.whole_body:
+            return self._upper_body(points, normals, outline, capture_ns)
+        self._steady = None
+        starts = first_starts(self._template, outline)
+        if self._frame > 0:
+            starts = later_starts(self._template, outline, self._frame - 1)
+        carried = [_carried(fit) for side in self._sides for fit in side[:KEPT]]
+        self._weigh(fitted(self._template, points, normals, outline, starts, carried), capture_ns)
+        return self._decided(outline)
 
-    def _fitted(self, points, normals, outline):
-        template = self._template
-        used = np.ones(len(template.cone_links), np.bool_)
-
-        def fits(starts, count, iterations, gates_m):
-            step = max(len(points) // count, 1)
-            few, few_normals = points[::step], normals[::step]
-            out = [fit_template(template, few, few_normals, s, used, outline.floor_y, iterations, gates_m, EDGE_M) for s in starts]
-            return sorted(out, key=lambda fit: fit.cost)
-
-        carried = [_rebased(fit) for side in self._sides for fit in side]
-        coarse = fits(self._starts.next(outline), COARSE_POINTS, COARSE_ITERATIONS, COARSE_GATES_M)
-        coarse += fits(carried, COARSE_POINTS, CARRIED_ITERATIONS, CARRIED_GATES_M)
-        coarse.sort(key=lambda fit: fit.cost)
-        sides = _by_side(coarse)
-        return fits([fit for side in sides for fit in _different(side, KEPT)], FINE_POINTS, FINE_ITERATIONS, FINE_GATES_M)
-
-    def _divide(self, fits):
-        first, second = _by_side(fits)
-        if self._sides[0] and np.cos(facing(first[0]) - facing(self._sides[0][0])) < 0:
-            first, second = second, first
+    def _weigh(self, fits: list[TemplateFit], capture_ns: int) -> None:
+        """Divides the fits of this frame into the two sides and adds what they say."""
+        first, second = by_side(fits)
+        first_ns, last_ns = self._times_ns if self._frame else (capture_ns, capture_ns)
+        past_s = (capture_ns - last_ns) * 1e-9
+        said = second[0].cost - first[0].cost if second else 0.0
+        if self._frame:
+            said *= min(past_s / INDEPENDENT_S, 1.0)
+            cheapest = min((side[0] for side in self._sides if side), key=lambda fit: fit.cost)
+            walked = (first[0].theta - cheapest.theta)[[ROOT, ROOT + 2]]
+            forwards = np.array([np.sin(facing_rad(first[0])), np.cos(facing_rad(first[0]))])
+            said += WALKED_COST_PER_M * float(walked @ forwards)
+        if self._sides[0] and np.cos(facing_rad(first[0]) - facing_rad(self._sides[0][0])) < 0:
+            first, second, said = second, first, -said
         self._sides = first, second
-        if first and second:
-            self._evidence = MEMORY * self._evidence + second[0].cost - first[0].cost
-        self.debug.append((first[0].cost if first else None, second[0].cost if second else None, self._evidence))
+        self._evidence = self._evidence * float(np.exp(-past_s / MEMORY_S)) + said
+        self._times_ns = first_ns, capture_ns
+        self._frame += 1
 
-    def _decided(self, outline, count):
-        better = self._sides[0] if self._evidence >= 0 else self._sides[1]
-        if not better:
-            return NoPose('no side')
-        self.best = better[0]
-        near = (self.best.cone >= 0) & (np.abs(self.best.distance_m) < SURFACE_M)
-        self.near = near.mean()
-        found = judged(self._template, self.best, outline, count)
-        if isinstance(found, NoPose): return found
-        self.found = found
-        if self.near > 0.8 and self.best.unseen_share < 0.2 and abs(self._evidence) > 25:
-            return found
-        return NoPose(f'near {near.mean():.2f} unseen {self.best.unseen_share:.2f} evidence {self._evidence:.0f} cost {self.best.cost:.0f}')
+    def _decided(self, outline: Outline) -> InitialPose | NoPose:
+        better, other = self._sides if self._evidence >= 0 else self._sides[::-1]
+        waited = min((self._times_ns[1] - self._times_ns[0]) * 1e-9 / PATIENCE_S, 1.0)
+        inliers, cost, evidence = (a + (b - a) * waited for a, b in (INLIERS, COST, EVIDENCE))
+        if not better or (other and other[0].cost < better[0].cost) or abs(self._evidence) < evidence:
+            return NoPose("front and back are not told apart yet")
+        best = better[0]
+        if max(abs(best.theta[ROOT + 3]), abs(best.theta[ROOT + 5])) > UPRIGHT_RAD:
+            return NoPose("nobody stands upright")
+        if inlier_share(best) < inliers:
+            return NoPose(f"only {inlier_share(best):.0%} of the cloud lies on one human body")
+        if best.unseen_share > UNSEEN_SHARE:
+            return NoPose(f"{best.unseen_share:.0%} of the body is not seen")
+        if best.cost > cost:
+            return NoPose(f"no human shape fits well (cost {best.cost:.0f}, needed {cost:.0f})")
+        return judged(self._template, best, outline)
 
-
-def facing(fit: TemplateFit) -> float:
-    return fit.heading + float(fit.theta[ROOT + 4])
-
-
-def _by_side(fits):
-    """Fits that face as the best one does, and those that face the other way."""
-    out = [], []
-    for fit in fits:
-        out[int(np.cos(facing(fit) - facing(fits[0])) < 0)].append(fit)
-    return out
-
-
-def _different(fits, count):
-    kept = []
-    for fit in fits:
-        if all(np.abs(fit.theta - other.theta)[ROOT + 3:].max() > 0.3 or abs(np.sin(facing(fit)-facing(other)))>0.4 for other in kept):
-            kept.append(fit)
-        if len(kept) == count: break
-    return kept
+    def _upper_body(self, points: Floats, normals: Floats, outline: Outline, capture_ns: int) -> InitialPose | NoPose:
+        """Somebody seated shows no legs for long; somebody who comes into the picture does so for a moment."""
+        count = int(outline.person.sum())
+        since_ns, top_y, before = self._steady or (capture_ns, outline.top_y, count)
+        if abs(outline.top_y - top_y) > STEADY_M or abs(count - before) > STEADY_SHARE * before:
+            since_ns, top_y, before = capture_ns, outline.top_y, count
+        self._forget()
+        self._steady = since_ns, top_y, before
+        if capture_ns - since_ns < STEADY_S * 1e9:
+            return NoPose("an upper body: waiting whether more of the person comes into view")
+        fits = fitted(self._template, points, normals, outline, first_starts(self._template, outline), [])
+        return judged(self._template, fits[0], outline)
 
 
-def _rebased(fit: TemplateFit) -> TemplateFit:
+def _carried(fit: TemplateFit) -> TemplateFit:
+    """The fit as a start for the next frame: its place is no surprise there, its pose is as unusual as before."""
     theta, prior = fit.theta.copy(), fit.prior.copy()
-    heading = facing(fit)
     theta[ROOT + 4] = 0.0
     prior[ROOT : ROOT + 3] = theta[ROOT : ROOT + 3]
-    return unfitted(theta, heading, prior)
+    return unfitted(theta, facing_rad(fit), prior)

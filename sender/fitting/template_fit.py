@@ -41,11 +41,11 @@ class TemplateFit:
     unseen_share: float
 
 
-def unfitted(
-    start: NDArray[np.float64], heading: float, prior: NDArray[np.float64] | None = None
-) -> TemplateFit:
+def unfitted(start: NDArray[np.float64], heading: float, prior: NDArray[np.float64] | None = None) -> TemplateFit:
     """Parameters ``start`` (P,) and ``heading`` [rad about y] to fit from, and around which the priors are centred."""
-    return TemplateFit(start, start if prior is None else prior, heading, np.empty(0, np.int64), np.empty(0), np.inf, 1.0)
+    return TemplateFit(
+        start, start if prior is None else prior, heading, np.empty(0, np.int64), np.empty(0), np.inf, 1.0
+    )
 
 
 def fit_template(
