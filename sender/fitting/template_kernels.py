@@ -11,6 +11,7 @@ import numpy as np
 from numba import njit
 
 _STEP = 1e-5  # of the difference quotients
+_LIFTED_M = 0.05  # scale of the floor's pull on a sole above it
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
@@ -262,11 +263,13 @@ def add_extents(points, ends, radii, d_ends, d_radii, tips, edge_m, sigma_m, H, 
 
 @njit(nogil=True, cache=True, error_model="numpy")
 def add_floor(floor_y, ends, radii, d_ends, d_radii, feet, sigma_m, H, g):  # type: ignore[no-untyped-def]
-    """Rows that put the underside of the ``feet`` cones' ends on the floor."""
+    """Rows that put the underside of the ``feet`` cones' ends on the floor: none below it, those near it on it; a foot
+    that is lifted is left alone (Geman–McClure)."""
     row = np.empty(len(g))
     for k in feet:
         for end in range(2):
             d = ends[k, end, 1] - radii[k, end] - floor_y
             for p in range(len(row)):
                 row[p] = d_ends[p, k, end, 1] - d_radii[p, k, end]
-            _add_row(row, d, 1.0 / (sigma_m * sigma_m), H, g)
+            ratio = 1.0 / (1.0 + (max(d, 0.0) / _LIFTED_M) ** 2)
+            _add_row(row, d, ratio * ratio / (sigma_m * sigma_m), H, g)
