@@ -32,7 +32,8 @@ class NoPose:
 class Outline:
     """``floor_y``: height of the floor or of the lowest points, ``top_y`` of the crown or the raised hands,
     ``stature_m`` [m]; ``whole_body``: legs and feet are there; ``middle`` (2,): x, z of the trunk [m]; ``headings``:
-    facings to try [rad about y]; ``person`` (N,): points that can belong to the person."""
+    facings to try [rad about y]; ``person`` (N,): points that can belong to the person; ``one_sided``: seen by
+    one camera, or by cameras side by side."""
 
     floor_y: float
     top_y: float
@@ -41,6 +42,7 @@ class Outline:
     middle: Floats
     headings: tuple[float, ...]
     person: Mask
+    one_sided: bool
 
 
 def outline_of(points: Floats, normals: Floats, floor_y: float | None) -> Outline | NoPose:
@@ -95,7 +97,7 @@ def _whole_body(own: Floats, body: Mask, span: tuple[float, float], camera_side:
     across = directions[:, 1]  # the widest: shoulders and arms
     heading = float(np.arctan2(-across[1], across[0]))  # the left, +x, of a person of heading 0 turned there
     middle = np.median(trunk, axis=0) - 0.05 * stature * camera_side
-    return Outline(floor, top, stature, True, middle, (heading, heading + np.pi), body)
+    return Outline(floor, top, stature, True, middle, (heading, heading + np.pi), body, bool(camera_side.any()))
 
 
 def _upper_body(points: Floats, normals: Floats, body: Mask, top: float, camera_side: Floats) -> Outline | NoPose:
@@ -114,4 +116,6 @@ def _upper_body(points: Floats, normals: Floats, body: Mask, top: float, camera_
     if np.linalg.norm(reach) > 0.007 * AVERAGE_STATURE_M * len(points):
         facing, turns_deg = reach, (-30.0, -10.0, 10.0, 30.0)  # arms reach forwards, whichever side the camera sees
     headings = tuple(float(np.arctan2(facing[0], facing[1]) + np.deg2rad(turn)) for turn in turns_deg)
-    return Outline(top - AVERAGE_STATURE_M, top, AVERAGE_STATURE_M, False, middle, headings, person)
+    return Outline(
+        top - AVERAGE_STATURE_M, top, AVERAGE_STATURE_M, False, middle, headings, person, bool(camera_side.any())
+    )

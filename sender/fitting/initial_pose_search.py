@@ -9,6 +9,8 @@ Wald 1945); a T- or A-pose passes at once. Less is asked for as time passes, to 
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -23,10 +25,21 @@ Floats = NDArray[np.float64]
 
 KEPT = 2  # fits of each side carried to the next frame
 PATIENCE_S = 1.5  # until the least is asked for
-INLIERS = (0.90, 0.85)  # of the cloud, on the first frame and after PATIENCE_S
-COST = (160.0, 240.0)  # robust, per 400 points (template_fit)
-EVIDENCE = (60.0, 40.0)  # of one side against the other, in units of cost
-UNSEEN_SHARE = 0.15  # of the body's surface
+
+
+class Demands(NamedTuple):
+    """What a start needs. ``inliers``: share of the cloud on the body; ``unseen``: at most this share of the body
+    without points; ``cost``: at most, robust, per 400 points (template_fit); ``evidence``: in units of cost."""
+
+    inliers: float
+    unseen: float
+    cost: float
+    evidence: float
+
+
+# On the first frame and after PATIENCE_S: seen from all around, and from one side, where more poses look alike.
+ALL_AROUND = Demands(0.90, 0.15, 160.0, 60.0), Demands(0.85, 0.15, 240.0, 40.0)
+ONE_SIDED = Demands(0.93, 0.15, 140.0, 100.0), Demands(0.88, 0.30, 220.0, 70.0)
 UPRIGHT_RAD = 1.0
 MEMORY_S = 1.0  # evidence fades: early frames may have had no fit near the truth
 INDEPENDENT_S = 0.1  # frames closer in time say the same thing
@@ -47,18 +60,21 @@ class InitialPoseSearch:
         self._evidence = 0.0  # for the first side
         self._frame = 0
         self._times_ns = (0, 0)  # of the first frame and of the last one
+        self._lowest_y: float | None = None  # floor, as far as it was seen
         self._steady: tuple[int, float, int] | None = None  # upper body: since when [ns], its top [m], its points
 
     def step(self, cloud: PointCloud, capture_ns: int) -> InitialPose | NoPose:
         """The start pose in ``cloud`` (N points, world, y up) of ``capture_ns``, or why there is none yet."""
         points, normals = cloud.positions.astype(np.float64), cloud.normals.astype(np.float64)
-        outline = outline_of(points, normals, self._floor_y)
+        outline = outline_of(points, normals, self._floor_y if self._lowest_y is None else self._lowest_y)
         if isinstance(outline, NoPose):
             self._forget()
             return outline
         if not outline.whole_body:
             return self._upper_body(points, normals, outline, capture_ns)
         self._steady = None
+        if self._floor_y is None:  # who stood there before has not lost their legs by crouching
+            self._lowest_y = outline.floor_y if self._lowest_y is None else min(self._lowest_y, outline.floor_y)
         starts = first_starts(self._template, outline)
         if self._frame > 0:
             starts = later_starts(self._template, outline, self._frame - 1)
@@ -88,18 +104,19 @@ class InitialPoseSearch:
     def _decided(self, outline: Outline) -> InitialPose | NoPose:
         better, other = self._sides if self._evidence >= 0 else self._sides[::-1]
         waited = min((self._times_ns[1] - self._times_ns[0]) * 1e-9 / PATIENCE_S, 1.0)
-        inliers, cost, evidence = (a + (b - a) * waited for a, b in (INLIERS, COST, EVIDENCE))
-        if not better or (other and other[0].cost < better[0].cost) or abs(self._evidence) < evidence:
+        first, last = ONE_SIDED if outline.one_sided else ALL_AROUND
+        demands = Demands(*(a + (b - a) * waited for a, b in zip(first, last, strict=True)))
+        if not better or (other and other[0].cost < better[0].cost) or abs(self._evidence) < demands.evidence:
             return NoPose("front and back are not told apart yet")
         best = better[0]
         if max(abs(best.theta[ROOT + 3]), abs(best.theta[ROOT + 5])) > UPRIGHT_RAD:
             return NoPose("nobody stands upright")
-        if inlier_share(best) < inliers:
+        if inlier_share(best) < demands.inliers:
             return NoPose(f"only {inlier_share(best):.0%} of the cloud lies on one human body")
-        if best.unseen_share > UNSEEN_SHARE:
+        if best.unseen_share > demands.unseen:
             return NoPose(f"{best.unseen_share:.0%} of the body is not seen")
-        if best.cost > cost:
-            return NoPose(f"no human shape fits well (cost {best.cost:.0f}, needed {cost:.0f})")
+        if best.cost > demands.cost:
+            return NoPose(f"no human shape fits well (cost {best.cost:.0f}, at most {demands.cost:.0f})")
         return judged(self._template, best, outline)
 
     def _upper_body(self, points: Floats, normals: Floats, outline: Outline, capture_ns: int) -> InitialPose | NoPose:
