@@ -42,7 +42,9 @@ def parse_arguments(arguments: list[str] | None = None) -> argparse.Namespace:
     capture.add_argument(
         "--state", dest="state_folder", type=Path, metavar="DIR", help="where the body found is kept for a restart"
     )
-    parser.add_argument("--tracker", dest="tracking.tracker", metavar="NAME", help="gauss-newton (default) or articp")
+    parser.add_argument(
+        "--tracker", dest="tracking.tracker", metavar="NAME", help="gauss-newton (default), articp or particles"
+    )
     add_daemon_options(parser)
     return parser.parse_args(arguments)
 

@@ -46,10 +46,12 @@ class CaptureSettings:
 
 @dataclass(frozen=True, slots=True)
 class TrackingSettings:
-    """``tracker``: by name. ``points``: how many points of each frame's cloud it is given."""
+    """``tracker``: by name. ``points``: how many points of each frame's cloud it is given. ``weights``: where a tracker
+    with particles weighs them."""
 
-    tracker: Literal["gauss-newton", "articp"] = "gauss-newton"
+    tracker: Literal["gauss-newton", "articp", "particles"] = "gauss-newton"
     points: int = 2500
+    weights: Literal["numba", "opencl"] = "numba"
 
     def __post_init__(self) -> None:
         if not 100 <= self.points <= 50_000:

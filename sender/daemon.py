@@ -30,6 +30,7 @@ from sender.channels_out import SenderChannels
 from sender.config import SenderSettings
 from sender.fitting.body_model import BodyModel
 from sender.fitting.open_tracker import open_tracker
+from sender.fitting.particle_weights_opencl import OpenClUnavailable
 from sender.pipeline import CandidatePath, Candidates, SkeletonPath, StreamIdentity, TrackedFrame
 from sender.receiver_links import ReceiverLinks
 from sender.reconstruction.background import BackgroundModel
@@ -69,6 +70,8 @@ class SenderDaemon:
                     await asyncio.to_thread(source.close)
             except CaptureError as error:
                 raise DaemonError(str(error)) from error
+            except OpenClUnavailable as error:
+                raise DaemonError(f'[tracking] weights = "opencl": {error}') from error
 
     async def _open_source(self, body: BodyModel | None) -> FrameSource:
         """Open the cameras, and rehearse meanwhile: the first frames are worth as much as any.
@@ -119,7 +122,7 @@ class _Stream:
         self._timer = StageTimer(clock)
         self._statistics = RunStatistics(self._timer)
         identity = StreamIdentity(settings.person, secrets.randbits(32))
-        self._tracker = open_tracker(settings.tracking.tracker, body)
+        self._tracker = open_tracker(settings.tracking.tracker, body, settings.tracking.weights)
         self._skeletons = self._skeleton_path(identity)
         self._candidates = CandidatePath(identity, settings.poses, self._timer)
         self._scheduler = MeshScheduler()

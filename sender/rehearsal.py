@@ -14,6 +14,7 @@ from sender.capture.frame_set import DepthFrame, FrameSet
 from sender.config import CandidateSettings
 from sender.fitting.body_model import BodyModel
 from sender.fitting.gauss_newton_tracker import GaussNewtonSettings, GaussNewtonTracker
+from sender.fitting.particle_tracker import ParticleSettings, ParticleTracker
 from sender.fitting.tracker import FitResult
 from sender.pipeline import CandidatePath, SkeletonPath, StreamIdentity, TrackedFrame
 from sender.reconstruction.background import BackgroundModel
@@ -47,6 +48,16 @@ def rehearse_restart() -> None:
     body.add(cloud, forward_kinematics(skeleton, pose))
     tracker = GaussNewtonTracker(GaussNewtonSettings(), BodyModel.from_bytes(body.to_bytes()))
     for index in range(2):
+        tracker.track(cloud, index * FRAME_NS)
+
+
+def rehearse_particles() -> None:
+    """Follow a mannequin for a few frames with ellipsoids and particles."""
+    skeleton, pose = mannequin()
+    cloud = PointSampler([mannequin_camera()]).points([_view(mannequin_camera())])
+    tracker = ParticleTracker(ParticleSettings())
+    tracker.start_from(skeleton, pose, cloud, 0)
+    for index in range(1, 3):
         tracker.track(cloud, index * FRAME_NS)
 
 
