@@ -1,7 +1,8 @@
 """Draw the received skeletons over the recording they were found in: ``overlay.py RECORDING OUT.png [FRAMES]``.
 
 Runs both daemons on the recording (once, as fast as frames are fitted) and makes a contact sheet of frames spread over
-it: depth in grey, or colour where there is some; joints that were not seen are left out.
+it, by each camera in turn: depth in grey, silhouettes, or colour where there is some; joints that were not seen are
+left out.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ import bisect
 import sys
 import tempfile
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -44,10 +46,10 @@ def main() -> None:
     packets = sorted(session.skeletons.values(), key=lambda packet: packet.capture_ns)
     times_ns = [packet.capture_ns - epoch_ns for packet in packets]
     print(f"{len(packets)} skeletons for {len(recording.frames)} frames")
-    shown = [frame for frame in recording.frames if frame[1] == 0]
     tiles = []
-    for index in np.linspace(0, len(shown) - 1, count).astype(int):
-        time_ns, camera, number = shown[index]
+    for turn, share in enumerate(np.linspace(0, 1, count)):  # by all cameras in turn
+        shown = [frame for frame in recording.frames if frame[1] == turn % len(recording.cameras)]
+        time_ns, camera, number = shown[int(share * (len(shown) - 1))]
         at = bisect.bisect_right(times_ns, time_ns + 1_000_000) - 1
         packet = packets[at] if at >= 0 else None
         tiles.append(tile(recording, camera, number, packet, session.bodies))
@@ -71,16 +73,27 @@ def tile(
     return picture
 
 
-def picture_of(depth: NDArray[np.uint16], colour: NDArray[np.uint8] | None) -> tuple[NDArray[np.uint8], float]:
-    """A frame as a picture of ``TILE_HEIGHT`` rows, and how much larger that is than the frame."""
-    near, far = np.percentile(depth[depth > 0], [1, 99]) if (depth > 0).any() else (0, 1)
-    grey = np.clip(230 - 180 * (depth.astype(float) - near) / max(far - near, 1), 30, 255).astype(np.uint8)
-    picture = np.repeat(np.where(depth > 0, grey, 0)[..., None], 3, axis=2).astype(np.uint8)
-    if colour is not None:
-        picture = (colour // 2 + picture // 2).astype(np.uint8)
+def picture_of(first: NDArray[Any] | None, colour: NDArray[np.uint8] | None) -> tuple[NDArray[np.uint8], float]:
+    """A frame as a picture of ``TILE_HEIGHT`` rows, and how much larger that is than the frame. ``first``: its depth
+    [mm] uint16 or its silhouette uint8; one of both may be None."""
+    assert first is not None or colour is not None
+    if first is None:
+        assert colour is not None
+        picture = colour
+    else:
+        grey = shaded(first) if first.dtype == np.uint16 else first // 2
+        picture = np.repeat(grey[..., None], 3, axis=2)
+        if colour is not None:
+            picture = (colour // 2 + picture // 2).astype(np.uint8)
     scale = TILE_HEIGHT / picture.shape[0]
-    picture = np.asarray(cv2.resize(picture, None, fx=scale, fy=scale), np.uint8)
-    return picture, scale
+    return np.asarray(cv2.resize(picture, None, fx=scale, fy=scale), np.uint8), scale
+
+
+def shaded(depth: NDArray[np.uint16]) -> NDArray[np.uint8]:
+    """Near is light; no reading is black."""
+    near, far = np.percentile(depth[depth > 0], [1, 99]) if np.any(depth > 0) else (0, 1)
+    grey = np.clip(230 - 180 * (depth.astype(float) - near) / max(far - near, 1), 30, 255)
+    return np.where(depth > 0, grey, 0).astype(np.uint8)
 
 
 def draw(picture: NDArray[np.uint8], camera: Camera, skeleton: Skeleton, pose: SkeletonPose, scale: float) -> None:

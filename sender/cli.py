@@ -35,6 +35,9 @@ def parse_arguments(arguments: list[str] | None = None) -> argparse.Namespace:
     capture.add_argument("--motion", dest="capture.motion", metavar="ID", help="a motion clip of --data")
     capture.add_argument("--data", dest="capture.data", type=Path, metavar="DIR", help="folder with bodies/ and mocap/")
     capture.add_argument("--cameras", dest="capture.cameras", type=int, metavar="N", help="virtual cameras (default 4)")
+    capture.add_argument(
+        "--no-depth", dest="capture.depth", action="store_false", default=None, help="use a rig's colour only"
+    )
     capture.add_argument("--loop", dest="capture.loop", action="store_true", default=None, help="repeat the recording")
     capture.add_argument(
         "--as-fast-as-possible", dest="capture.realtime", action="store_false", default=None, help="not at its own rate"

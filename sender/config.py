@@ -13,7 +13,7 @@ from common.transport.zenoh_session import LinkSettings
 @dataclass(frozen=True, slots=True)
 class CaptureSettings:
     """Where frames come from. ``source``: "virtual" (a rig process of our own), "rig" (attach to a running one at
-    ``rig_socket``) or "recording" (``recording`` is a folder or file)."""
+    ``rig_socket``) or "recording" (``recording`` is a folder or file). ``depth``: False takes a rig's colour only."""
 
     source: Literal["virtual", "rig", "recording"] = "virtual"
     body: str = "builtin"
@@ -24,6 +24,7 @@ class CaptureSettings:
     height: int = 480
     frame_rate_hz: float = 30.0
     noise: bool = True
+    depth: bool = True
     seed: int = 0
     rig_socket: Path | None = None
     recording: Path | None = None

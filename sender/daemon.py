@@ -33,8 +33,7 @@ from sender.fitting.open_tracker import open_tracker
 from sender.fitting.particle_weights_opencl import OpenClUnavailable
 from sender.pipeline import CandidatePath, Candidates, SkeletonPath, StreamIdentity, TrackedFrame
 from sender.receiver_links import ReceiverLinks
-from sender.reconstruction.background import BackgroundModel
-from sender.reconstruction.foreground_points import PointSampler
+from sender.reconstruction.person_points import DepthReconstruction, HullReconstruction
 from sender.rehearsal import rehearse_all, rehearse_candidates
 
 log = logging.getLogger(__name__)
@@ -147,11 +146,10 @@ class _Stream:
 
     def _skeleton_path(self, identity: StreamIdentity) -> SkeletonPath:
         source, settings = self._source, self._settings
-        rooms = zip(source.cameras, source.empty_room, strict=True)
+        reconstruction = DepthReconstruction if source.has_depth else HullReconstruction
         return SkeletonPath(
             identity,
-            [BackgroundModel(camera, room) for camera, room in rooms],
-            PointSampler(source.cameras, settings.tracking.points),
+            reconstruction(source.cameras, source.empty_room, settings.tracking.points),
             self._tracker,
             source.frame_rate_hz,
             self._timer,
@@ -231,7 +229,7 @@ class _Stream:
     def _make_metrics(self) -> Metrics:
         metrics = Metrics()
         metrics.stages(self._timer)
-        metrics.counter("frames_captured_total", "Depth frames read, all cameras", lambda: self._capture.frames)
+        metrics.counter("frames_captured_total", "Frames read, all cameras", lambda: self._capture.frames)
         metrics.counter("frame_sets_total", "Synchronised sets", lambda: self._capture.sets)
         metrics.counter("skeletons_published_total", "Skeleton packets published", lambda: self._published)
         metrics.counter("candidate_poses_sent_total", "Deliveries", lambda: self._poses_sent)

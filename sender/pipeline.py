@@ -6,8 +6,7 @@ The two paths are DISPOSE Fig. 1: ``SkeletonPath`` runs for every frame and neve
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,8 +26,7 @@ from sender.capture.frame_set import FrameSet
 from sender.config import CandidateSettings
 from sender.fitting.start_joints import skeleton_from_joints
 from sender.fitting.tracker import FitResult, Tracker
-from sender.reconstruction.background import BackgroundModel
-from sender.reconstruction.foreground_points import PointSampler
+from sender.reconstruction.person_points import Reconstruction
 
 BODY_CHANGE_M = 0.001  # sizes that differ by less are the same body to a receiver
 
@@ -59,13 +57,12 @@ class TrackedFrame:
 
 
 class SkeletonPath:
-    """Every frame: background → points → pose → packet."""
+    """Every frame: the person's points → pose → packet."""
 
     def __init__(
         self,
         identity: StreamIdentity,
-        backgrounds: Sequence[BackgroundModel],
-        sampler: PointSampler,
+        reconstruction: Reconstruction,
         tracker: Tracker,
         frame_rate_hz: float,
         timer: StageTimer,
@@ -73,8 +70,7 @@ class SkeletonPath:
         start_joints: NDArray[np.floating] | None = None,
     ) -> None:
         self._identity = identity
-        self._backgrounds = backgrounds
-        self._sampler = sampler
+        self._reconstruction = reconstruction
         self._tracker = tracker
         self._frame_rate_hz = frame_rate_hz
         self._timer = timer
@@ -84,24 +80,18 @@ class SkeletonPath:
         self._revision = 0
         self._body: Skeleton | None = None
         self._previous: tuple[int, SkeletonPose] | None = None
+        self._last_joints: NDArray[np.float32] | None = None
 
     def process(self, frames: FrameSet) -> TrackedFrame:
         """Fit the person in one frame set."""
-        with self._timer.stage("background"):
-            views = self._views(frames)
-        with self._timer.stage("points"):
-            cloud = self._sampler.points(views)
+        person = self._reconstruction.person(frames, self._last_joints, self._timer)
         with self._timer.stage("fitting"):
-            fit = self._fit(cloud, frames.capture_ns)
+            fit = self._fit(person.cloud, frames.capture_ns)
         if fit is None:
-            return TrackedFrame(frames.capture_ns, views, None)
+            return TrackedFrame(frames.capture_ns, person.views, None)
+        fit = replace(fit, confidence=fit.confidence * person.certainty)
         with self._timer.stage("packet"):
-            return self._pack(frames, views, fit)
-
-    def _views(self, frames: FrameSet) -> tuple[View, ...]:
-        pairs = zip(self._backgrounds, frames.frames, strict=True)
-        views = (background.foreground(frame) for background, frame in pairs if frame is not None)
-        return tuple(view for view in views if view is not None)
+            return self._pack(frames, person.views, fit)
 
     def _fit(self, cloud: PointCloud, capture_ns: int) -> FitResult | None:
         if self._start_joints is None or len(cloud) == 0:
@@ -132,6 +122,7 @@ class SkeletonPath:
         self._sequence += 1
         self._previous = (capture_ns, fit.pose)
         T_world_link = forward_kinematics(body, pose)
+        self._last_joints = T_world_link[:, :3, 3] if fit.confidence > 0 else None
         complete = None not in frames.frames
         return TrackedFrame(capture_ns, views, fit, packet, message, body, pose, T_world_link, complete)
 

@@ -17,8 +17,8 @@ from sender.fitting.gauss_newton_tracker import GaussNewtonSettings, GaussNewton
 from sender.fitting.particle_tracker import ParticleSettings, ParticleTracker
 from sender.fitting.tracker import FitResult
 from sender.pipeline import CandidatePath, SkeletonPath, StreamIdentity, TrackedFrame
-from sender.reconstruction.background import BackgroundModel
 from sender.reconstruction.foreground_points import PointSampler
+from sender.reconstruction.person_points import DepthReconstruction
 
 FRAME_NS = 33_333_333
 _IDENTITY = StreamIdentity(0, 0)
@@ -32,8 +32,8 @@ def rehearse_fitting() -> None:
     room = np.where(depth > 0, 0, 4000).astype(np.uint16)
     clock = MonotonicClock()
     tracker = GaussNewtonTracker(GaussNewtonSettings(building_s=2 * FRAME_NS / 1e9))
-    background, sampler = BackgroundModel(camera, room), PointSampler([camera])
-    path = SkeletonPath(_IDENTITY, [background], sampler, tracker, 30.0, StageTimer(clock), clock)
+    reconstruction = DepthReconstruction([camera], [room])
+    path = SkeletonPath(_IDENTITY, reconstruction, tracker, 30.0, StageTimer(clock), clock)
     for index in range(1, 5):
         frame = DepthFrame(0, index, index * FRAME_NS, depth, colour)
         path.process(FrameSet(frame.capture_ns, (frame,)))

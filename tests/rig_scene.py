@@ -14,8 +14,7 @@ from sender.capture.rig_layout import RigSettings
 from sender.capture.rig_process import RigRenderer
 from sender.fitting.gauss_newton_tracker import GaussNewtonSettings, GaussNewtonTracker
 from sender.pipeline import SkeletonPath, StreamIdentity, TrackedFrame
-from sender.reconstruction.background import BackgroundModel
-from sender.reconstruction.foreground_points import PointSampler
+from sender.reconstruction.person_points import DepthReconstruction
 
 RATE_HZ = 30.0
 IDENTITY = StreamIdentity(person=0, epoch=77)
@@ -49,11 +48,10 @@ def frame_set(sequence: int) -> FrameSet:
 def skeleton_path(tracker: GaussNewtonTracker | None = None) -> SkeletonPath:
     """The sender's fast path before those cameras."""
     cameras = renderer().cameras
-    backgrounds = [BackgroundModel(camera, renderer().empty_room(index)) for index, camera in enumerate(cameras)]
+    rooms = [renderer().empty_room(index) for index in range(len(cameras))]
     return SkeletonPath(
         IDENTITY,
-        backgrounds,
-        PointSampler(cameras),
+        DepthReconstruction(cameras, rooms),
         tracker or GaussNewtonTracker(GaussNewtonSettings()),
         RATE_HZ,
         StageTimer(ManualClock()),

@@ -22,7 +22,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-PROTOCOL = 1
+PROTOCOL = 2
 MAX_MESSAGE_BYTES = 65536
 _PAGE = 4096
 
@@ -45,13 +45,18 @@ class RingLayout:
         return 2 * self.width * self.height
 
     @property
+    def colour_bytes(self) -> int:
+        return 3 * self.width * self.height
+
+    @property
     def slot_bytes(self) -> int:
         """Number (8 bytes, a page so that pixels are aligned), depth, colour; a whole number of pages."""
-        return -(-(_PAGE + self.depth_bytes + 3 * self.width * self.height) // _PAGE) * _PAGE
+        return -(-(_PAGE + self.depth_bytes + self.colour_bytes) // _PAGE) * _PAGE
 
     @property
     def rooms_bytes(self) -> int:
-        return -(-self.cameras * self.depth_bytes // _PAGE) * _PAGE
+        """Depth of all cameras, then colour; a whole number of pages."""
+        return -(-self.cameras * (self.depth_bytes + self.colour_bytes) // _PAGE) * _PAGE
 
     @property
     def total_bytes(self) -> int:
@@ -83,10 +88,13 @@ class FrameRing:
             raise ValueError(f"shared memory of {os.fstat(descriptor).st_size} bytes, {layout.total_bytes} expected")
         return cls(mmap.mmap(descriptor, layout.total_bytes, prot=mmap.PROT_READ), layout)
 
-    def room(self, camera: int) -> NDArray[np.uint16]:
-        """The empty room of a camera (H, W) uint16 [mm], in place."""
-        shape = self.layout.height, self.layout.width
-        return np.ndarray(shape, np.uint16, self._memory, camera * self.layout.depth_bytes)
+    def room(self, camera: int) -> tuple[NDArray[np.uint16], NDArray[np.uint8]]:
+        """The empty room of a camera: depth (H, W) uint16 [mm] and colour (H, W, 3) uint8, in place."""
+        layout = self.layout
+        shape = layout.height, layout.width
+        depth = np.ndarray(shape, np.uint16, self._memory, camera * layout.depth_bytes)
+        colours = layout.cameras * layout.depth_bytes
+        return depth, np.ndarray((*shape, 3), np.uint8, self._memory, colours + camera * layout.colour_bytes)
 
     @contextmanager
     def writing(self, camera: int, number: int) -> Iterator[tuple[NDArray[np.uint16], NDArray[np.uint8]]]:

@@ -1,9 +1,9 @@
-"""What cameras deliver: depth frames, and sets of them taken at one instant."""
+"""What cameras deliver: frames, with depth or without, and sets of them taken at one instant."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +25,34 @@ class DepthFrame:
     depth_mm: NDArray[np.uint16]
     colour: NDArray[np.uint8] | None
 
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Height and width [pixels]; ValueError when depth and colour are not images of one size."""
+        return _common_shape((self.depth_mm, np.uint16, 2), (self.colour, np.uint8, 3))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ColourFrame:
+    """One image of a camera without depth; index, sequence and time as a ``DepthFrame``'s.
+
+    ``colour`` (H, W, 3) uint8 RGB; ``silhouette`` (H, W) uint8, 128 and more = a person, where the source has found
+    the people itself. One of them may be None.
+    """
+
+    camera_index: int
+    sequence: int
+    capture_ns: int
+    colour: NDArray[np.uint8] | None
+    silhouette: NDArray[np.uint8] | None = None
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Height and width [pixels]; ValueError without an image, or when the two are not of one size."""
+        return _common_shape((self.silhouette, np.uint8, 2), (self.colour, np.uint8, 3))
+
+
+Frame = DepthFrame | ColourFrame
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FrameSet:
@@ -34,7 +62,7 @@ class FrameSet:
     """
 
     capture_ns: int
-    frames: tuple[DepthFrame | None, ...]
+    frames: tuple[Frame | None, ...]
 
 
 class FrameSource(Protocol):
@@ -42,7 +70,9 @@ class FrameSource(Protocol):
 
     ``read`` blocks up to ``timeout_s`` for the next frame of any camera and returns None when none came in time;
     it raises ``EndOfFrames`` when there will be no more and ``CaptureError`` when the source broke.
-    ``empty_room`` is the depth of each camera without a person (H, W) uint16 mm, where the source has one.
+    ``has_depth``: whether its frames are ``DepthFrame``s; else they are ``ColourFrame``s.
+    ``empty_room`` shows each camera's view without a person, where the source has it: the depth (H, W) uint16 mm, or
+    frames (F, H, W, 3) uint8 RGB of a colour camera.
     ``start_joints`` (16, 3) [m, world; ``NAMED_JOINTS`` order] are the person's joints in the first frame, where the
     source knows them, as a sensor with a tracker of its own does.
     """
@@ -50,12 +80,14 @@ class FrameSource(Protocol):
     @property
     def cameras(self) -> tuple[Camera, ...]: ...
     @property
-    def empty_room(self) -> tuple[NDArray[np.uint16] | None, ...]: ...
+    def has_depth(self) -> bool: ...
+    @property
+    def empty_room(self) -> tuple[NDArray[Any] | None, ...]: ...
     @property
     def frame_rate_hz(self) -> float: ...
     @property
     def start_joints(self) -> NDArray[np.floating] | None: ...
-    def read(self, timeout_s: float) -> DepthFrame | None: ...
+    def read(self, timeout_s: float) -> Frame | None: ...
     def close(self) -> None: ...
 
 
@@ -65,3 +97,17 @@ class CaptureError(Exception):
 
 class EndOfFrames(Exception):
     """The source has played its last frame."""
+
+
+def _common_shape(*images: tuple[NDArray[Any] | None, type, int]) -> tuple[int, ...]:
+    """Height and width of the images there are (image, its dtype, its axes)."""
+    shapes = set()
+    for image, dtype, axes in images:
+        if image is None:
+            continue
+        if image.dtype != dtype or image.ndim != axes or image.shape[2:] not in ((), (3,)):
+            raise ValueError(f"an image of {image.dtype} {image.shape}")
+        shapes.add(image.shape[:2])
+    if len(shapes) != 1:
+        raise ValueError(f"images of sizes {sorted(shapes)}" if shapes else "a frame without an image")
+    return shapes.pop()

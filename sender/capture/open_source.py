@@ -20,7 +20,7 @@ def open_source(settings: CaptureSettings) -> FrameSource:
         return RecordedRig.open(settings.recording, settings.realtime, settings.loop)
     if settings.source == "rig":
         assert settings.rig_socket is not None
-        return VirtualRig.attach(settings.rig_socket)
+        return VirtualRig.attach(settings.rig_socket, settings.depth)
     return VirtualRig.start(
         RigSettings(
             performer=settings.body,
@@ -32,5 +32,6 @@ def open_source(settings: CaptureSettings) -> FrameSource:
             fps=settings.frame_rate_hz,
             seed=settings.seed,
             noise=settings.noise,
-        )
+        ),
+        settings.depth,
     )

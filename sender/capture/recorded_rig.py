@@ -7,29 +7,33 @@ from collections import deque
 from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from common.geometry.camera_model import Camera
-from sender.capture.frame_set import CaptureError, DepthFrame, EndOfFrames
+from sender.capture.calibrated_videos import CalibratedVideos
+from sender.capture.frame_set import CaptureError, ColourFrame, DepthFrame, EndOfFrames, Frame
 from sender.capture.recording_folder import DepthkitFolder, RecordingFolder
 from sender.capture.utd_mhad import UtdMhadSequence
 
 _DECODED_AHEAD = 2  # frames per camera; decoding two PNGs takes milliseconds
 _DECODERS = 2
 
-Images = tuple[NDArray[np.uint16], NDArray[np.uint8] | None]
+Images = tuple[NDArray[Any] | None, NDArray[np.uint8] | None]
 
 
 class Recording(Protocol):
-    """What a folder or file holds. ``frames`` is the index of (time_ns, camera, number), sorted."""
+    """What a folder or file holds. ``frames`` is the index of (time_ns, camera, number), sorted; ``has_depth`` and
+    ``empty_room`` as a ``FrameSource``'s."""
 
     @property
     def cameras(self) -> tuple[Camera, ...]: ...
     @property
-    def empty_room(self) -> tuple[NDArray[np.uint16] | None, ...]: ...
+    def has_depth(self) -> bool: ...
+    @property
+    def empty_room(self) -> tuple[NDArray[Any] | None, ...]: ...
     @property
     def frame_rate_hz(self) -> float: ...
     @property
@@ -37,12 +41,14 @@ class Recording(Protocol):
     @property
     def start_joints(self) -> NDArray[np.floating] | None: ...
     def load(self, camera_index: int, number: int) -> Images:
-        """Depth (H, W) uint16 [mm] and colour (H, W, 3) uint8 RGB or None; CaptureError when they cannot be read."""
+        """Depth (H, W) uint16 [mm], or, of a camera without depth, silhouette (H, W) uint8 or None; and colour
+        (H, W, 3) uint8 RGB or None. CaptureError when they cannot be read."""
         ...
 
 
 def open_recording(path: Path) -> Recording:
-    """The recording at ``path``: our own folder (docs/recordings.md), a UTD-MHAD file or folder, a Depthkit folder.
+    """The recording at ``path``: our own folder (docs/recordings.md), a UTD-MHAD file or folder, a Depthkit folder,
+    or videos or silhouettes of calibrated colour cameras.
 
     Raises:
         CaptureError: nothing there that is known, or it is malformed; the message names the file and the fault.
@@ -53,7 +59,10 @@ def open_recording(path: Path) -> Recording:
         return RecordingFolder(path)
     if (path / "intrinsics.json").exists():
         return DepthkitFolder(path)
-    raise CaptureError(f"{path}: no recording here (recording.json, intrinsics.json, Depth/*.mat or a .mat file)")
+    if (path / "calibration.json").exists():
+        return CalibratedVideos(path)
+    known = "recording.json, intrinsics.json, calibration.json, Depth/*.mat or a .mat file"
+    raise CaptureError(f"{path}: no recording here ({known})")
 
 
 class RecordedRig:
@@ -86,7 +95,11 @@ class RecordedRig:
         return self._recording.cameras
 
     @property
-    def empty_room(self) -> tuple[NDArray[np.uint16] | None, ...]:
+    def has_depth(self) -> bool:
+        return self._recording.has_depth
+
+    @property
+    def empty_room(self) -> tuple[NDArray[Any] | None, ...]:
         return self._recording.empty_room
 
     @property
@@ -102,7 +115,7 @@ class RecordedRig:
         """The recording's time 0 on the clock of the capture times; None before the first ``read``."""
         return self._start_ns
 
-    def read(self, timeout_s: float) -> DepthFrame | None:
+    def read(self, timeout_s: float) -> Frame | None:
         """The next frame, or None when none is due in time.
 
         Raises:
@@ -119,11 +132,19 @@ class RecordedRig:
             self._decoding.popleft()
             self._decode_ahead()
             try:
-                return DepthFrame(camera, sequence, capture_ns, *images.result())
+                return self._frame(camera, sequence, capture_ns, *images.result())
             except CaptureError as error:
                 self.dropped += 1
                 self.last_error = str(error)
         raise EndOfFrames(f"the recording is over, {self.dropped} frames could not be read")
+
+    def _frame(
+        self, camera: int, sequence: int, capture_ns: int, first: NDArray[Any] | None, colour: NDArray[np.uint8] | None
+    ) -> Frame:
+        if not self.has_depth:
+            return ColourFrame(camera, sequence, capture_ns, colour, first)
+        assert first is not None
+        return DepthFrame(camera, sequence, capture_ns, first, colour)
 
     def close(self) -> None:
         """Stop decoding."""

@@ -1,7 +1,7 @@
 """Recordings as folders of images: our own format (docs/recordings.md) and a decoded Depthkit clip.
 
-Per camera a folder with ``depth/NNNNNN.png`` (16 bit, mm, 0 = no reading) and ``color/NNNNNN.png`` or ``.jpg``;
-one JSON file says the rest.
+Per camera a folder with ``depth/NNNNNN.png`` (16 bit, mm, 0 = no reading) and ``color/NNNNNN.png`` or ``.jpg``, or
+without depth; one JSON file says the rest.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from common.body.skeleton import NAMED_JOINTS
 from common.geometry.camera_model import Camera
 from sender.capture.assumed_pose import assumed_pose
 from sender.capture.camera_record import camera_from_record, camera_to_record
-from sender.capture.frame_set import CaptureError, DepthFrame
+from sender.capture.frame_set import CaptureError, DepthFrame, Frame
 
 FORMAT, VERSION = "telepose recording", 1
 _LOOKED_AT = 10  # frames that an unknown camera pose is estimated from
@@ -28,31 +28,44 @@ _LOOKED_AT = 10  # frames that an unknown camera pose is estimated from
 
 @dataclass(frozen=True, slots=True)
 class _CameraFolder:
-    """The images of one camera; ``near_mm``, ``far_mm``: other readings are cut."""
+    """The images of one camera; ``near_mm``, ``far_mm``: other readings are cut. ``kind``: the folder whose images
+    are its frames, depth/, or without it mask/ or color/."""
 
     camera: Camera
     folder: Path
     near_mm: int
     far_mm: int
+    kind: str
 
     def numbers(self) -> list[int]:
         """The frames there are, in order."""
-        files = [file for file in (self.folder / "depth").glob("*.png") if file.stem.isdigit()]
-        if not files:
-            raise CaptureError(f"{self.folder / 'depth'}: no frames NNNNNN.png")
-        return sorted(int(file.stem) for file in files)
+        suffixes = (".png",) if self.kind == "depth" else (".png", ".jpg")
+        files = [file for file in (self.folder / self.kind).iterdir() if file.suffix in suffixes]
+        numbers = sorted({int(file.stem) for file in files if file.stem.isdigit()})
+        if not numbers:
+            raise CaptureError(f"{self.folder / self.kind}: no frames NNNNNN.png")
+        return numbers
 
-    def load(self, number: int) -> tuple[NDArray[np.uint16], NDArray[np.uint8] | None]:
-        """Depth with cut and mask applied, and colour where there is one."""
+    def load(self, number: int) -> tuple[NDArray[Any] | None, NDArray[np.uint8] | None]:
+        """Depth with cut and mask applied, or the mask alone of a camera without depth; and colour."""
+        mask, colour = _find(self.folder / "mask", number), _find(self.folder / "color", number)
+        first: NDArray[Any] | None = None
+        if self.kind == "depth":
+            first = self.depth(number)
+        elif mask is not None:
+            first = _read(mask, cv2.IMREAD_GRAYSCALE, self.camera)
+        if colour is None:
+            return first, None
+        return first, read_colour(colour, self.camera)
+
+    def depth(self, number: int) -> NDArray[np.uint16]:
+        """Depth [mm] with cut and mask applied."""
         depth = read_depth(_numbered(self.folder / "depth", number, ".png"), self.camera)
         depth[(depth < self.near_mm) | (depth > self.far_mm)] = 0
         mask = _find(self.folder / "mask", number)
         if mask is not None:
             depth[_read(mask, cv2.IMREAD_GRAYSCALE, self.camera) < 128] = 0
-        colour = _find(self.folder / "color", number)
-        if colour is None:
-            return depth, None
-        return depth, cv2.cvtColor(_read(colour, cv2.IMREAD_COLOR, self.camera), cv2.COLOR_BGR2RGB).astype(np.uint8)
+        return depth
 
 
 class RecordingFolder:
@@ -64,7 +77,7 @@ class RecordingFolder:
 
     def __init__(self, path: Path) -> None:
         file = path / "recording.json"
-        content = _read_json(file)
+        content = read_json(file)
         try:
             if content["format"] != FORMAT or content["version"] != VERSION:
                 raise ValueError(f"not {FORMAT!r} version {VERSION}")
@@ -73,7 +86,9 @@ class RecordingFolder:
             if not self._folders:
                 raise ValueError("no cameras")
             self.cameras = tuple(folder.camera for folder in self._folders)
-            self.empty_room = tuple(_empty_room(path, record, self.cameras) for record in content["cameras"])
+            self.has_depth = _all_have_depth(self._folders)
+            pairs = zip(self._folders, content["cameras"], strict=True)
+            self.empty_room = tuple(_empty_room(path, record, folder) for folder, record in pairs)
             self.start_joints = _start_joints(content.get("start_joints"))
             times = [_times(f, r, self.frame_rate_hz) for f, r in zip(self._folders, content["cameras"], strict=True)]
         except KeyError as error:
@@ -82,7 +97,7 @@ class RecordingFolder:
             raise CaptureError(f"{file}: {error}") from None
         self.frames = _index(times)
 
-    def load(self, camera_index: int, number: int) -> tuple[NDArray[np.uint16], NDArray[np.uint8] | None]:
+    def load(self, camera_index: int, number: int) -> tuple[NDArray[Any] | None, NDArray[np.uint8] | None]:
         """See ``recorded_rig.Recording``."""
         return self._folders[camera_index].load(number)
 
@@ -94,9 +109,11 @@ class DepthkitFolder:
         CaptureError: a field or the frames are missing.
     """
 
+    has_depth = True
+
     def __init__(self, path: Path) -> None:
         file = path / "intrinsics.json"
-        content = _read_json(file)
+        content = read_json(file)
         try:
             record = {"name": path.name, "T_world_camera": np.eye(4), **content}
             if not np.isclose(float(content.get("depth_unit_m", 0.001)), 0.001):
@@ -104,7 +121,9 @@ class DepthkitFolder:
             self.frame_rate_hz = _frame_rate(content["fps"])
             folder = _camera_folder(path, record | {"folder": "."})
             numbers = folder.numbers()
-            looked_at = [folder.load(number)[0] for number in numbers[:: max(len(numbers) // _LOOKED_AT, 1)]]
+            if folder.kind != "depth":
+                raise ValueError("no folder depth/")
+            looked_at = [folder.depth(number) for number in numbers[:: max(len(numbers) // _LOOKED_AT, 1)]]
             camera = folder.camera
             pose = assumed_pose(looked_at, camera.fx, camera.fy, camera.cx, camera.cy)
             self.cameras: tuple[Camera, ...] = (camera_from_record(record | {"T_world_camera": pose}),)
@@ -117,7 +136,7 @@ class DepthkitFolder:
         self.empty_room: tuple[NDArray[np.uint16] | None, ...] = (None,)
         self.frames = _index([{n: round((n - numbers[0]) * 1e9 / self.frame_rate_hz) for n in numbers}])
 
-    def load(self, camera_index: int, number: int) -> tuple[NDArray[np.uint16], NDArray[np.uint8] | None]:
+    def load(self, camera_index: int, number: int) -> tuple[NDArray[Any] | None, NDArray[np.uint8] | None]:
         """See ``recorded_rig.Recording``."""
         return self._folder.load(number)
 
@@ -142,9 +161,9 @@ def _start_joints(record: Any) -> NDArray[np.float64] | None:
 def write_recording(
     path: Path,
     cameras: Sequence[Camera],
-    frames: Iterable[DepthFrame],
+    frames: Iterable[Frame],
     frame_rate_hz: float,
-    empty_room: Sequence[NDArray[np.uint16] | None] = (),
+    empty_room: Sequence[NDArray[Any] | None] = (),
 ) -> None:
     """Write frames as a recording in our format into the new or empty folder ``path``; times are kept.
 
@@ -156,18 +175,22 @@ def write_recording(
     records: list[dict[str, Any]] = []
     for index, camera in enumerate(cameras):
         records.append({**camera_to_record(camera), "folder": camera.name, "timestamps_ns": {}})
-        if index < len(empty_room) and empty_room[index] is not None:
+        room = empty_room[index] if index < len(empty_room) else None
+        if room is not None:
             records[-1]["empty_room"] = f"{camera.name}/empty_room.png"
-            _write(path / records[-1]["empty_room"], empty_room[index])
+            _write(path / records[-1]["empty_room"], room if room.ndim == 2 else _reversed(room[0]))
     start_ns: int | None = None
     for frame in frames:
         start_ns = frame.capture_ns if start_ns is None else start_ns
         record = records[frame.camera_index]
         record["timestamps_ns"][str(frame.sequence)] = frame.capture_ns - start_ns
-        _write(path / record["folder"] / "depth" / f"{frame.sequence:06d}.png", frame.depth_mm)
+        folder, file = path / record["folder"], f"{frame.sequence:06d}.png"
+        if isinstance(frame, DepthFrame):
+            _write(folder / "depth" / file, frame.depth_mm)
+        elif frame.silhouette is not None:
+            _write(folder / "mask" / file, frame.silhouette)
         if frame.colour is not None:
-            colour = cv2.cvtColor(frame.colour, cv2.COLOR_RGB2BGR)
-            _write(path / record["folder"] / "color" / f"{frame.sequence:06d}.png", colour)
+            _write(folder / "color" / file, _reversed(frame.colour))
     content = {"format": FORMAT, "version": VERSION, "frame_rate_hz": frame_rate_hz, "cameras": records}
     (path / "recording.json").write_text(json.dumps(content, indent=1))
 
@@ -184,7 +207,18 @@ def read_depth(file: Path, camera: Camera) -> NDArray[np.uint16]:
     return image.astype(np.uint16, copy=False)
 
 
-def _read_json(file: Path) -> dict[str, Any]:
+def read_colour(file: Path, camera: Camera) -> NDArray[np.uint8]:
+    """A picture (H, W, 3) uint8 RGB of the camera's size; CaptureError when it cannot be read."""
+    return _reversed(_read(file, cv2.IMREAD_COLOR, camera))
+
+
+def _reversed(picture: NDArray[Any]) -> NDArray[np.uint8]:
+    """RGB from BGR, or the other way round."""
+    return np.ascontiguousarray(picture[..., ::-1], np.uint8)
+
+
+def read_json(file: Path) -> dict[str, Any]:
+    """The JSON object in a file; CaptureError when there is none."""
     try:
         content = json.loads(file.read_text())
     except (OSError, ValueError) as error:
@@ -204,17 +238,28 @@ def _frame_rate(value: Any) -> float:
 def _camera_folder(path: Path, record: dict[str, Any]) -> _CameraFolder:
     camera = camera_from_record(record)
     folder = _inside(path, record.get("folder", camera.name))
-    if not (folder / "depth").is_dir():
-        raise CaptureError(f"{folder}: no folder depth/ of camera {camera.name}")
+    kind = next((kind for kind in ("depth", "mask", "color") if (folder / kind).is_dir()), None)
+    if kind is None:
+        raise CaptureError(f"{folder}: no folder depth/, mask/ or color/ of camera {camera.name}")
     near_mm = round(1000 * float(record.get("near_m") or 0))
-    return _CameraFolder(camera, folder, near_mm, round(1000 * float(record.get("far_m") or 65.535)))
+    return _CameraFolder(camera, folder, near_mm, round(1000 * float(record.get("far_m") or 65.535)), kind)
 
 
-def _empty_room(path: Path, record: dict[str, Any], cameras: Sequence[Camera]) -> NDArray[np.uint16] | None:
+def _all_have_depth(folders: Sequence[_CameraFolder]) -> bool:
+    without = [folder.camera.name for folder in folders if folder.kind != "depth"]
+    if without and len(without) < len(folders):
+        raise ValueError(f"cameras {', '.join(without)} have no depth/, but others do")
+    return not without
+
+
+def _empty_room(path: Path, record: dict[str, Any], folder: _CameraFolder) -> NDArray[Any] | None:
     name = record.get("empty_room")
     if name is None:
+        if folder.kind == "color":
+            raise ValueError(f"camera {folder.camera.name}: colour alone needs an empty_room, or silhouettes in mask/")
         return None
-    return read_depth(_inside(path, name), next(camera for camera in cameras if camera.name == record["name"]))
+    file = _inside(path, name)
+    return read_depth(file, folder.camera) if folder.kind == "depth" else read_colour(file, folder.camera)[None]
 
 
 def _times(folder: _CameraFolder, record: dict[str, Any], rate_hz: float) -> dict[int, int]:

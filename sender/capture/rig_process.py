@@ -75,6 +75,10 @@ class RigRenderer:
         """Averaged readings (H, W) uint16 [mm] of the room without the performer."""
         return averaged([self._sensors[camera].background_reading() for _ in range(_ROOM_FRAMES)])
 
+    def empty_room_colour(self, camera: int) -> np.ndarray:
+        """The picture (H, W, 3) uint8 of the room without the performer."""
+        return self._room_colours[camera]
+
     def view(self, camera: int, time_s: float, depth: np.ndarray, colour: np.ndarray) -> None:
         """Fill ``depth`` (H, W) uint16 [mm] and ``colour`` (H, W, 3) uint8 with camera ``camera`` at ``time_s``."""
         if self._posed[0] != time_s:
@@ -103,8 +107,9 @@ class Rig:
         self._dropout = np.random.default_rng(settings.seed)
         self._ring, self._descriptor = FrameRing.create(RingLayout(count, SLOTS, settings.width, settings.height))
         for index in range(count):
-            self._ring.room(index)[:] = renderer.empty_room(index)
-        renderer.view(0, 0.0, *(a.copy() for a in (self._ring.room(0), np.zeros_like(renderer._room_colours[0]))))
+            depth, colour = self._ring.room(index)
+            depth[:], colour[:] = renderer.empty_room(index), renderer.empty_room_colour(index)
+        renderer.view(0, 0.0, *(image.copy() for image in self._ring.room(0)))
         self.counters = RigCounters()
         self._epoch_ns = 0
         self._next = (1, 0)  # frame number, camera

@@ -10,9 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-import numpy as np
-
-from sender.capture.frame_set import DepthFrame, FrameSet
+from sender.capture.frame_set import Frame, FrameSet
 
 MAX_OPEN = 8  # instants waited for at once; the oldest has to go when there are more
 RESTART_NS = 2_000_000_000  # a frame so much older than the last set means that the source's clock started anew
@@ -37,7 +35,7 @@ class SynchronizerCounters:
 class _OpenSet:
     anchor_ns: int  # capture time of the first frame to arrive
     opened_ns: int
-    frames: list[DepthFrame | None] = field(default_factory=list)
+    frames: list[Frame | None] = field(default_factory=list)
 
 
 class Synchronizer:
@@ -67,7 +65,7 @@ class Synchronizer:
         self._delivered_ns: int | None = None  # anchor of the last delivered set
         self._seen_ns: list[list[int]] = [[] for _ in range(camera_count)]  # last capture times of each camera
 
-    def push(self, frame: DepthFrame, now_ns: int) -> list[FrameSet]:
+    def push(self, frame: Frame, now_ns: int) -> list[FrameSet]:
         """Take a frame in; the sets that can be delivered now, oldest first."""
         if not self._acceptable(frame):
             self.counters.rejected += 1
@@ -106,15 +104,13 @@ class Synchronizer:
         """When the oldest waiting set was opened, to know when ``expire`` has something to do."""
         return min((waiting.opened_ns for waiting in self._open), default=None)
 
-    def _acceptable(self, frame: DepthFrame) -> bool:
+    def _acceptable(self, frame: Frame) -> bool:
         if not 0 <= frame.camera_index < self._count:
             return False
-        shape = frame.depth_mm.shape
-        if frame.depth_mm.dtype != np.uint16 or (
-            self._shapes is not None and shape != self._shapes[frame.camera_index]
-        ):
+        try:
+            return self._shapes is None or frame.shape == self._shapes[frame.camera_index]
+        except ValueError:
             return False
-        return len(shape) == 2 and (frame.colour is None or frame.colour.shape == (*shape, 3))
 
     def _home(self, time_ns: int) -> _OpenSet | None:
         """The nearest open set within tolerance."""

@@ -36,6 +36,7 @@ class UtdMhadSequence:
     """
 
     frame_rate_hz = FRAME_RATE_HZ
+    has_depth = True
 
     def __init__(self, path: Path) -> None:
         self.path = path if path.is_file() else _first(path / "Depth")

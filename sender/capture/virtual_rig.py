@@ -15,14 +15,13 @@ from pathlib import Path
 from typing import IO, Any
 
 import msgpack
-import numpy as np
 from numpy.typing import NDArray
 
 import sender
 from common.geometry.camera_model import Camera
 from sender.capture.camera_record import camera_from_record
 from sender.capture.frame_ring import MAX_MESSAGE_BYTES, PROTOCOL, FrameRing, RingLayout
-from sender.capture.frame_set import CaptureError, DepthFrame
+from sender.capture.frame_set import CaptureError, ColourFrame, DepthFrame, Frame
 from sender.capture.rig_layout import RigSettings
 
 START_TIMEOUT_S = 60.0  # a first start compiles kernels
@@ -37,8 +36,9 @@ class VirtualRig:
     (cpu_s, frames, late, skipped, unannounced). Not thread-safe: close it when no thread is reading any more.
     """
 
-    def __init__(self, connection: socket.socket, process: RigProcess | None = None) -> None:
+    def __init__(self, connection: socket.socket, process: RigProcess | None = None, depth: bool = True) -> None:
         """Use ``start`` or ``attach``."""
+        self._has_depth = depth
         self._connection = connection
         self._process = process
         self._announced: list[tuple[int, int, int]] = []  # heap of (capture_ns, camera, number)
@@ -51,22 +51,22 @@ class VirtualRig:
             raise CaptureError(f"rig's greeting: {error}") from error
 
     @classmethod
-    def start(cls, settings: RigSettings) -> VirtualRig:
-        """Start a rig that ends with this process.
+    def start(cls, settings: RigSettings, depth: bool = True) -> VirtualRig:
+        """Start a rig that ends with this process. ``depth`` False: as if its cameras saw colour only.
 
         Raises:
             CaptureError: the rig did not start; the message has its last words.
         """
         process = RigProcess(settings)
         try:
-            return cls(process.connect(START_TIMEOUT_S), process)
+            return cls(process.connect(START_TIMEOUT_S), process, depth)
         except BaseException:
             process.close()
             raise
 
     @classmethod
-    def attach(cls, socket_path: Path) -> VirtualRig:
-        """Use the rig listening at ``socket_path``.
+    def attach(cls, socket_path: Path, depth: bool = True) -> VirtualRig:
+        """Use the rig listening at ``socket_path``; ``depth`` as for ``start``.
 
         Raises:
             CaptureError: nobody answers there.
@@ -75,7 +75,7 @@ class VirtualRig:
         try:
             connection.settimeout(SILENCE_S)
             connection.connect(str(socket_path))
-            return cls(connection)
+            return cls(connection, depth=depth)
         except OSError as error:
             connection.close()
             raise CaptureError(f"no rig at {socket_path}: {error}") from error
@@ -88,7 +88,11 @@ class VirtualRig:
         return self._cameras
 
     @property
-    def empty_room(self) -> tuple[NDArray[np.uint16] | None, ...]:
+    def has_depth(self) -> bool:
+        return self._has_depth
+
+    @property
+    def empty_room(self) -> tuple[NDArray[Any] | None, ...]:
         return self._rooms
 
     @property
@@ -99,7 +103,7 @@ class VirtualRig:
     def start_joints(self) -> None:
         """A rig knows the truth, and does not tell."""
 
-    def read(self, timeout_s: float) -> DepthFrame | None:
+    def read(self, timeout_s: float) -> Frame | None:
         """The next frame of any camera in order of capture, or None when none is due in time.
 
         Raises:
@@ -122,12 +126,15 @@ class VirtualRig:
         if self._process is not None:
             self._process.close()
 
-    def _taken(self, capture_ns: int, camera: int, number: int) -> DepthFrame | None:
+    def _taken(self, capture_ns: int, camera: int, number: int) -> Frame | None:
         pixels = self._ring.copy(camera, number)
         if pixels is None:
             self.lost += 1
             return None
-        return DepthFrame(camera, number, capture_ns, *pixels)
+        depth_mm, colour = pixels
+        if not self._has_depth:
+            return ColourFrame(camera, number, capture_ns, colour)
+        return DepthFrame(camera, number, capture_ns, depth_mm, colour)
 
     def _hear(self, wait_s: float) -> bool:
         """Take in the messages that are there or come within ``wait_s``; whether there were any."""
@@ -185,7 +192,8 @@ class VirtualRig:
         self.epoch_ns = int(hello["epoch_ns"])
         width, height = self._cameras[0].width, self._cameras[0].height
         self._ring = FrameRing.attach(descriptor, RingLayout(len(self._cameras), hello["slots"], width, height))
-        self._rooms = tuple(self._ring.room(index).copy() for index in range(len(self._cameras)))
+        rooms = [self._ring.room(index) for index in range(len(self._cameras))]
+        self._rooms = tuple(depth.copy() if self._has_depth else colour[None].copy() for depth, colour in rooms)
 
 
 class RigProcess:
