@@ -119,8 +119,15 @@ def _images(folder: Path, camera: Camera) -> _Video | _Silhouettes:
 def _room(file: Path, camera: Camera) -> NDArray[np.uint8]:
     """Frames (F, H, W, 3) uint8 RGB."""
     video = _Video(file, camera)
-    chosen = np.unique(np.linspace(0, len(video.numbers) - 1, _ROOM_FRAMES).astype(int))
-    return np.stack([video.load(int(number))[1] for number in chosen])
+    frames = []
+    for number in video.numbers[:: max(len(video.numbers) // _ROOM_FRAMES, 1)]:
+        try:
+            frames.append(video.load(number)[1])
+        except CaptureError:  # a header may promise a frame or two more than there are
+            break
+    if not frames:
+        raise CaptureError(f"{file}: no frame can be decoded")
+    return np.stack(frames)
 
 
 def _camera(name: str, width: int, height: int, record: dict[str, Any]) -> Camera:

@@ -18,10 +18,10 @@ from common.geometry.point_cloud import PointCloud
 
 Floats = NDArray[np.floating]
 
-CELL_M = 0.10  # points nearer than this are connected
+CELL_M = 0.06  # points nearer than this are connected
 BLOCKS_ACROSS = 64  # of an image, in which volumes are told apart
 LEAST_SHARE = 0.02  # smaller volumes are splinters where outlines graze each other
-LEAST_HEIGHT_M = 0.8  # of a person
+LEAST_HEIGHT_M, MOST_WIDTH_M = 0.8, 1.3  # of a person, arms not spread; who spreads them is there alone
 OWN_PIXELS = 0.4  # share of its image, in some camera, that makes a volume real beyond doubt
 REACH_M = 0.35  # from the last pose: how far a body's surface and its motion since go
 LEAP_M = 0.7  # from where somebody was that had no pose yet
@@ -68,11 +68,12 @@ class PersonFollower:
         size = np.bincount(volumes[volumes >= 0], minlength=len(real))
         if known and near.any():
             return int(np.argmax(np.bincount(volumes[(volumes >= 0) & near], minlength=len(real))))
-        heights = np.array([np.ptp(positions[volumes == index, 1]) for index in range(len(real))])
-        worth = real * size * (heights > LEAST_HEIGHT_M)
+        extents = np.array([np.ptp(positions[volumes == index], axis=0) for index in range(len(real))])
+        one = (extents[:, 1] > LEAST_HEIGHT_M) & (extents[:, [0, 2]].max(axis=1) < MOST_WIDTH_M)
+        worth = real * size * np.where(one, 1.0, 0.01)
         if self._middle is not None:
             middles = np.array([positions[volumes == index].mean(axis=0) for index in range(len(real))])
-            worth *= 1e-6 + (np.linalg.norm(middles - self._middle, axis=1) < LEAP_M)
+            worth *= 0.001 + (np.linalg.norm(middles - self._middle, axis=1) < LEAP_M)
         return int(np.argmax(worth))
 
 

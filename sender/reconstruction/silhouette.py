@@ -16,14 +16,14 @@ from numpy.typing import NDArray
 from common.geometry.camera_model import Camera
 from sender.capture.frame_set import ColourFrame
 
-BACKGROUND, UNSEEN, PERSON = 0, 128, 255  # UNSEEN: the lens does not reach there, so anybody might be
+BACKGROUND, PERSON = 0, 255
 _SHADOW = 127  # MOG2's own mark
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Silhouette:
-    """The people in one camera's view. ``camera``: a pinhole, no distortion. ``mask`` (H, W) uint8: ``PERSON``,
-    ``BACKGROUND``, or ``UNSEEN`` where the real lens does not reach."""
+    """The people in one camera's view. ``camera``: a pinhole, no distortion. ``mask`` (H, W) uint8: ``PERSON`` or
+    ``BACKGROUND``."""
 
     camera: Camera
     mask: NDArray[np.uint8]
@@ -50,12 +50,13 @@ class SilhouetteSettings:
 
 
 def pinhole_of(camera: Camera, longest_px: int) -> Camera:
-    """The camera without distortion that sees all that ``camera`` sees, at most ``longest_px`` [pixels] long."""
+    """A camera without distortion that sees nothing that ``camera`` does not see (of a bulging picture the corners are
+    lost), at most ``longest_px`` [pixels] long."""
     scale = min(longest_px / max(camera.width, camera.height), 1.0)
     width, height = max(round(camera.width * scale), 1), max(round(camera.height * scale), 1)
     if camera.distortion.any():
         size = camera.width, camera.height
-        matrix, _ = cv2.getOptimalNewCameraMatrix(camera.matrix, camera.distortion, size, 1.0, size)
+        matrix, _ = cv2.getOptimalNewCameraMatrix(camera.matrix, camera.distortion, size, 0.0, size)
     else:
         matrix = camera.matrix
     across, down = width / camera.width, height / camera.height
@@ -120,9 +121,7 @@ class SilhouetteModel:
     def _straightened(self, mask: NDArray[np.uint8]) -> NDArray[np.uint8]:
         if not self._camera.distortion.any():
             return mask
-        straight = cv2.remap(
-            mask, self._columns, self._rows, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=UNSEEN
-        )
+        straight = cv2.remap(mask, self._columns, self._rows, cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE)
         return np.asarray(straight, np.uint8)
 
 
