@@ -1,0 +1,283 @@
+"""Skeletons of several sensors merged by confidence into one (Yeung, Kwok & Wang 2013; DISPOSE §3).
+
+Each joint is the mean of what the sensors say, weighted by the inverse of a variance, and bones keep their lengths.
+The variance grows with what makes a sensor err: guessed joints, a person side-on to it or turned away, bones of a wrong
+length, a place far from where the past leads while another sensor's is near, noise of late, and data older than the
+others'. The past weighs sensors against each other and fills in what nobody sees; it does not slow the joints down.
+Sensors differ by centimetres all the time (calibration; the side they look at), so it is their motions that are
+averaged, each from where the joints are; a slow pull brings the joints to the mean of the places. Otherwise every
+change of weights would be a jump.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from sender.capture.outside_skeleton import JOINTS_BY_KIND, Instant, Sensor
+from sender.fitting.bone_lengths import RunningMedian, bones_of
+
+Floats = NDArray[np.float64]
+
+NOISE_M = 0.002  # of a tracked joint, before anything is known of a sensor
+LEAST_NOISE_M = 0.001
+NOISE_RATE = 0.05  # of the running mean of the noise, per frame
+ACCELERATION_M_S2 = 7.0  # usual for limbs: what a place in the past is worth
+PULL_S = 1.0  # over which the joints come to the mean of the places
+DISAGREEMENT_M = 0.03
+BONE_ERROR_M = 0.03
+SIDE_ON = 0.25  # weight of a sensor that sees the person from the side or from behind
+TRIAL_FRAMES = 64
+ANOTHER_PERSON = 0.08  # median difference of the bones' lengths
+VELOCITY_RATE = 0.6
+PAUSE_S = 0.3  # after so long the past does not say where the joints are
+ABSENCE_S = 2.0  # after so long it may be another person
+PROJECTIONS = 30
+PAST_M = 0.02  # what a place that the past leads to is worth at once
+UNSEEN_M = 0.1  # how well a joint is known that nobody sees
+SEEN = 0.5  # least confidence of a joint that sizes are learned from
+_TINY = 1e-12
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MergedSkeleton:
+    """``joints`` (J, 3) float64 [m, world] in the sensors' order; ``confidence`` (J,) in [0, 1]; ``spread_m``: RMS
+    distance between the joints and what the sensors said of them, after their constant differences."""
+
+    capture_ns: int
+    joints: Floats
+    confidence: Floats
+    spread_m: float
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _keep_lengths(joints, share, bones, lengths, rounds):  # type: ignore[no-untyped-def]
+    """Move joints (J, 3) until the ``bones`` (B, 2) have their ``lengths`` (B,) [m]; of a bone's two ends each moves by
+    its ``share`` (J,), a variance: what is known well stays."""
+    for _ in range(rounds):
+        worst = 0.0
+        for b in range(len(bones)):
+            i, j = bones[b, 0], bones[b, 1]
+            x, y, z = joints[j, 0] - joints[i, 0], joints[j, 1] - joints[i, 1], joints[j, 2] - joints[i, 2]
+            length = np.sqrt(x * x + y * y + z * z)
+            if length < 1e-9 or not lengths[b] > 0.0:
+                continue
+            excess = (length - lengths[b]) / (length * (share[i] + share[j]))
+            worst = max(worst, abs(length - lengths[b]))
+            for axis, d in enumerate((x, y, z)):
+                joints[i, axis] += share[i] * excess * d
+                joints[j, axis] -= share[j] * excess * d
+        if worst < 1e-5:
+            return
+
+
+class _Witness:
+    """What is remembered of one sensor: its last two skeletons, its noise, and where it places the joints (J, 3) [m]
+    compared with the merged skeleton (``bias``)."""
+
+    def __init__(self, joints: int) -> None:
+        self.noise = np.full(joints, NOISE_M**2)  # variance per axis [m²]
+        self.bias = np.zeros((joints, 3))
+        self.tracked = np.zeros(joints, np.bool_)
+        self._times_ns = (0, 0)
+        self._last: Floats | None = None
+        self._before: Floats | None = None
+
+    def take(self, capture_ns: int, joints: Floats) -> None:
+        """A skeleton (J, 3) of this sensor; one that was taken before says nothing about its noise."""
+        step_s, past_s = (capture_ns - self._times_ns[0]) * 1e-9, (self._times_ns[0] - self._times_ns[1]) * 1e-9
+        if self._last is not None and step_s == 0:
+            return
+        goes_on = 0 < step_s < PAUSE_S
+        if goes_on and self._last is not None and self._before is not None:
+            ahead = step_s / past_s
+            surprise = joints - self._last - ahead * (self._last - self._before)
+            variance = (surprise**2).mean(axis=1) / (1 + (1 + ahead) ** 2 + ahead**2)
+            variance = np.minimum(variance, 25 * self.noise)  # a jump is judged by the others, not by this
+            self.noise += NOISE_RATE * (np.maximum(variance, LEAST_NOISE_M**2) - self.noise)
+        self._before = self._last if goes_on else None
+        self._last, self._times_ns = joints, (capture_ns, self._times_ns[0])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Words:
+    """What S sensors say at one instant. ``places`` (S, J, 3): brought to the instant by the joints' velocity;
+    ``age_s`` (S,): by how much."""
+
+    witnesses: tuple[_Witness, ...]
+    positions: Floats  # of the sensors (S, 3)
+    places: Floats
+    confidence: Floats
+    age_s: Floats
+
+    @property
+    def staleness(self) -> Floats:
+        """Variance (S, 1) [m²] for what may have happened since."""
+        return np.asarray((0.5 * ACCELERATION_M_S2 * self.age_s[:, None] ** 2) ** 2)
+
+
+class SkeletonMerger:
+    """Merges the skeletons of ``sensors``, all of one ``kind`` (a key of ``JOINTS_BY_KIND``), instant after instant.
+
+    ``bones`` (B, 2) and ``lengths`` (B,) [m]: the joints they join, and their lengths as learned so far.
+    """
+
+    def __init__(self, kind: str, sensors: Sequence[Sensor]) -> None:
+        names = JOINTS_BY_KIND[kind]
+        self.bones = bones_of(kind)
+        self.lengths = np.full(len(self.bones), np.nan)
+        self._learned = RunningMedian(len(self.bones))
+        self._stranger: RunningMedian | None = None  # sizes of somebody who came after an absence
+        self._positions = np.array([sensor.position for sensor in sensors], np.float64).reshape(-1, 3)
+        self._sides = tuple([names.index(f"{s}_{joint}") for joint in ("shoulder", "hip")] for s in ("left", "right"))
+        self._witnesses = [_Witness(len(names)) for _ in sensors]
+        self._joints = np.full((len(names), 3), np.nan)
+        self._velocity = np.zeros((len(names), 3))
+        self._capture_ns: int | None = None
+
+    def merge(self, instant: Instant) -> MergedSkeleton:
+        """One skeleton from those of an instant (of one sensor or more), at the time of the newest.
+
+        Raises:
+            ValueError: a skeleton of another kind, or of a sensor there is not.
+        """
+        for skeleton in instant:
+            if len(skeleton.joints) != len(self._joints) or not 0 <= skeleton.sensor < len(self._witnesses):
+                raise ValueError(f"a {skeleton.kind} skeleton of sensor {skeleton.sensor} does not belong here")
+        capture_ns = max(skeleton.capture_ns for skeleton in instant)
+        passed_s = self._passed_s(capture_ns)
+        words = self._words(instant, capture_ns)
+        led = self._joints + self._velocity * passed_s
+        self._welcome(words, led)
+        said = words.places - np.array([witness.bias for witness in words.witnesses])
+        variance = self._variance(words, said, led)
+        joints = _mean(said, variance, led, passed_s)
+        self._keep_bones(joints, variance, words.confidence)
+        self._hold_on(words, joints, passed_s)
+        self._move_on(joints, words.confidence, capture_ns, passed_s)
+        apart = np.linalg.norm(said - joints, axis=2)[words.confidence > SEEN]
+        spread_m = float(np.sqrt((apart**2).mean())) if len(apart) else 0.0
+        return MergedSkeleton(capture_ns, joints, words.confidence.max(axis=0), spread_m)
+
+    def _passed_s(self, capture_ns: int) -> float:
+        """Since the last instant; after a pause the past is forgotten, after an absence the person as well."""
+        passed_s = np.inf if self._capture_ns is None else (capture_ns - self._capture_ns) * 1e-9
+        if 0 <= passed_s < PAUSE_S:
+            return float(passed_s)
+        self._joints = np.full_like(self._joints, np.nan)
+        self._velocity = np.zeros_like(self._velocity)
+        for witness in self._witnesses:
+            witness.bias[:], witness.tracked[:] = 0.0, False
+        if not 0 <= passed_s < ABSENCE_S:
+            self._stranger = RunningMedian(len(self.bones))
+        return 0.0
+
+    def _words(self, instant: Instant, capture_ns: int) -> _Words:
+        sensors = [skeleton.sensor for skeleton in instant]
+        joints = np.array([skeleton.joints for skeleton in instant], np.float64)
+        age_s = np.array([capture_ns - skeleton.capture_ns for skeleton in instant]) * 1e-9
+        for skeleton, own in zip(instant, joints, strict=True):
+            self._witnesses[skeleton.sensor].take(skeleton.capture_ns, own)
+        return _Words(
+            witnesses=tuple(self._witnesses[sensor] for sensor in sensors),
+            positions=self._positions[sensors],
+            places=joints + self._velocity * np.minimum(age_s, PAUSE_S)[:, None, None],
+            confidence=np.array([skeleton.confidence for skeleton in instant], np.float64),
+            age_s=age_s,
+        )
+
+    def _welcome(self, words: _Words, led: Floats) -> None:
+        """A joint that a sensor tracks again goes on from where it is led to by the others and the past."""
+        for witness, own, confidence in zip(words.witnesses, words.places, words.confidence, strict=True):
+            tracked = confidence > 0
+            again = tracked & ~witness.tracked
+            witness.bias[again] = np.nan_to_num(own - led)[again]
+            witness.tracked = tracked
+
+    def _variance(self, words: _Words, said: Floats, led: Floats) -> Floats:
+        """What each sensor's word for each joint is worth (S, J): a variance per axis [m²], infinite for what is not
+        tracked."""
+        away = np.nan_to_num(np.linalg.norm(said - led, axis=2))
+        least = np.where(words.confidence > 0, away, np.inf).min(axis=0)
+        excess = np.maximum(away - np.minimum(least, away), 0.0)
+        weight = words.confidence**2 * self._facing(words, led)[:, None] * self._length_trust(words.places)
+        weight = weight / (1 + (excess / DISAGREEMENT_M) ** 2) ** 2
+        noise = np.array([witness.noise for witness in words.witnesses]) + words.staleness
+        return np.where(weight > 0, noise / np.maximum(weight, _TINY), np.inf)
+
+    def _facing(self, words: _Words, joints: Floats) -> Floats:
+        """How much each sensor (S,) sees of the person from the front: 1 from the front, ``SIDE_ON`` from elsewhere."""
+        known = joints if np.isfinite(joints).all() else words.places[0]
+        left, right = (known[side].mean(axis=0) for side in self._sides)
+        facing = np.cross(left - right, [0.0, 1.0, 0.0])
+        towards = words.positions - (left + right) / 2
+        towards[:, 1] = 0.0
+        scale = np.linalg.norm(facing) * np.linalg.norm(towards, axis=1)
+        return np.asarray(np.maximum(towards @ facing / np.maximum(scale, _TINY), SIDE_ON))
+
+    def _length_trust(self, places: Floats) -> Floats:
+        """1 where the bones at a joint (S, J) have their lengths; of several the best one counts: a wrist in the wrong
+        place is not the elbow's fault."""
+        first, second = self.bones.T
+        error = np.abs(np.linalg.norm(places[:, first] - places[:, second], axis=2) - self.lengths)
+        least = np.full((places.shape[1], len(places)), np.inf)
+        for ends in (first, second):
+            np.minimum.at(least, ends, np.nan_to_num(error, nan=np.inf).T)
+        return np.asarray(1 / (1 + (np.where(np.isfinite(least), least, 0.0).T / BONE_ERROR_M) ** 2))
+
+    def _keep_bones(self, joints: Floats, variance: Floats, confidence: Floats) -> None:
+        """Learn the bones' lengths from the joints (J, 3), and give the joints' bones these lengths."""
+        first, second = self.bones.T
+        lengths = np.linalg.norm(joints[first] - joints[second], axis=1)
+        seen = confidence.max(axis=0) > SEEN
+        lengths[~(seen[first] & seen[second])] = np.nan
+        self._learn(lengths)
+        share = 1 / ((1 / variance).sum(axis=0) + 1 / UNSEEN_M**2)
+        _keep_lengths(joints, share, self.bones, self.lengths, PROJECTIONS)
+
+    def _learn(self, lengths: Floats) -> None:
+        """Learn from the ``lengths`` (B,) of one frame. After an absence they are learned anew aside, and taken when
+        they are clearly another person's."""
+        if self._stranger is None or not np.isfinite(self.lengths).any():
+            self.lengths = self._learned.update(lengths)
+            return
+        theirs = self._stranger.update(lengths)
+        if self._stranger.count < TRIAL_FRAMES:
+            return
+        if np.nanmedian(np.abs(theirs - self.lengths) / self.lengths) > ANOTHER_PERSON:
+            self._learned, self.lengths = self._stranger, theirs
+        self._stranger = None
+
+    def _hold_on(self, words: _Words, joints: Floats, passed_s: float) -> None:
+        """From here on each sensor's motion counts, from where the joints are now, and slowly its place as well."""
+        trust = words.confidence * self._facing(words, joints)[:, None]
+        total = trust.sum(axis=0)[:, None]
+        mean = (trust[..., None] * words.places).sum(axis=0) / np.maximum(total, _TINY)
+        pull = np.where(total > 0, min(passed_s / PULL_S, 1.0) * (mean - joints), 0.0)
+        for witness, own, stale in zip(words.witnesses, words.places, words.staleness, strict=True):
+            fresh = witness.noise / (witness.noise + stale)
+            witness.bias += fresh[:, None] * (own - joints - witness.bias) - pull
+
+    def _move_on(self, joints: Floats, confidence: Floats, capture_ns: int, passed_s: float) -> None:
+        if passed_s > 0:
+            velocity = np.nan_to_num((joints - self._joints) / passed_s)
+            self._velocity += VELOCITY_RATE * (velocity - self._velocity)
+        unseen = confidence.max(axis=0) == 0
+        for parent, joint in self.bones[: len(joints) - 1]:  # outwards: what nobody sees goes with its parent
+            if unseen[joint]:
+                self._velocity[joint] = self._velocity[parent]
+        self._joints, self._capture_ns = joints, capture_ns
+
+
+def _mean(said: Floats, variance: Floats, led: Floats, passed_s: float) -> Floats:
+    """The joints (J, 3): what the sensors say, and where nobody says anything, where the past leads; NaN of a joint
+    that nobody has seen."""
+    weight = 1 / variance
+    past = np.where(np.isfinite(led[:, 0]), 1 / (PAST_M + 0.5 * ACCELERATION_M_S2 * passed_s**2) ** 2, 0.0)
+    total = weight.sum(axis=0) + past
+    places = (weight[..., None] * said).sum(axis=0) + past[:, None] * np.nan_to_num(led)
+    return np.where(total[:, None] > 0, places / np.maximum(total, _TINY)[:, None], np.nan)
