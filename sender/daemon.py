@@ -24,12 +24,14 @@ from sender.candidate_poses.mesh_scheduler import MeshScheduler, SendRecord
 from sender.capture.capture_thread import CaptureThread
 from sender.capture.frame_set import CaptureError, FrameSet, FrameSource
 from sender.capture.open_source import open_source
+from sender.capture.recorded_skeletons import RecordedSkeletons
 from sender.capture.synchronizer import Synchronizer
 from sender.capture.virtual_rig import VirtualRig
 from sender.channels_out import SenderChannels
 from sender.config import SenderSettings
 from sender.fitting.body_model import BodyModel
 from sender.fitting.open_tracker import open_tracker
+from sender.fitting.outside_tracker import OutsideTracker
 from sender.fitting.particle_weights_opencl import OpenClUnavailable
 from sender.pipeline import CandidatePath, Candidates, SkeletonPath, StreamIdentity, TrackedFrame
 from sender.receiver_links import ReceiverLinks
@@ -122,6 +124,7 @@ class _Stream:
         self._statistics = RunStatistics(self._timer)
         identity = StreamIdentity(settings.person, secrets.randbits(32))
         self._tracker = open_tracker(settings.tracking.tracker, body, settings.tracking.weights)
+        self._outside = _outside_tracker(source)
         self._skeletons = self._skeleton_path(identity)
         self._candidates = CandidatePath(identity, settings.poses, self._timer)
         self._scheduler = MeshScheduler()
@@ -155,6 +158,7 @@ class _Stream:
             self._timer,
             self._clock,
             source.start_joints,
+            self._outside,
         )
 
     def _make_synchronizer(self) -> Synchronizer:
@@ -220,7 +224,7 @@ class _Stream:
         log.debug("send %s", record)
 
     def _tell_status(self) -> None:
-        status = self._tracker.status
+        status = (self._outside or self._tracker).status
         what = status.partition(":")[0]  # figures behind the colon change with every frame
         if what != self._last_status:
             self._last_status = what
@@ -273,3 +277,10 @@ class _Stream:
             "rig_cpu_share": rig.status.get("cpu_s", 0.0) / max(rig_elapsed_s, 1e-3) if rig else None,
             "rig": rig.status if rig else None,
         }
+
+
+def _outside_tracker(source: FrameSource) -> OutsideTracker | None:
+    """For a source whose sensors track by themselves."""
+    if not isinstance(source, RecordedSkeletons):
+        return None
+    return OutsideTracker(source.recording.kind, source.recording.sensors)

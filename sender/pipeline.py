@@ -24,6 +24,7 @@ from common.wire.skeleton_packet import SkeletonPacket, encode_skeleton, quantiz
 from sender.candidate_poses.usable_pose_set import UsablePoseSet, UsablePoseSettings
 from sender.capture.frame_set import FrameSet
 from sender.config import CandidateSettings
+from sender.fitting.outside_tracker import OutsideTracker
 from sender.fitting.start_joints import skeleton_from_joints
 from sender.fitting.tracker import FitResult, Tracker
 from sender.reconstruction.person_points import Reconstruction
@@ -57,7 +58,7 @@ class TrackedFrame:
 
 
 class SkeletonPath:
-    """Every frame: the person's points → pose → packet."""
+    """Every frame: the person's points → pose → packet, or the sensors' skeletons → pose (``outside``) → packet."""
 
     def __init__(
         self,
@@ -68,6 +69,7 @@ class SkeletonPath:
         timer: StageTimer,
         clock: Clock,
         start_joints: NDArray[np.floating] | None = None,
+        outside: OutsideTracker | None = None,
     ) -> None:
         self._identity = identity
         self._reconstruction = reconstruction
@@ -76,6 +78,7 @@ class SkeletonPath:
         self._timer = timer
         self._clock = clock
         self._start_joints = start_joints
+        self._outside = outside
         self._sequence = 0
         self._revision = 0
         self._body: Skeleton | None = None
@@ -84,6 +87,8 @@ class SkeletonPath:
 
     def process(self, frames: FrameSet) -> TrackedFrame:
         """Fit the person in one frame set."""
+        if self._outside is not None:
+            return self._process_skeletons(self._outside, frames)
         person = self._reconstruction.person(frames, self._last_joints, self._timer)
         with self._timer.stage("fitting"):
             fit = self._fit(person.cloud, frames.capture_ns)
@@ -92,6 +97,14 @@ class SkeletonPath:
         fit = replace(fit, confidence=fit.confidence * person.certainty)
         with self._timer.stage("packet"):
             return self._pack(frames, person.views, fit)
+
+    def _process_skeletons(self, outside: OutsideTracker, frames: FrameSet) -> TrackedFrame:
+        with self._timer.stage("fitting"):
+            fit = outside.track(frames.skeletons)
+        if fit is None:
+            return TrackedFrame(frames.capture_ns, (), None)
+        with self._timer.stage("packet"):
+            return self._pack(frames, (), fit)
 
     def _fit(self, cloud: PointCloud, capture_ns: int) -> FitResult | None:
         if self._start_joints is None or len(cloud) == 0:

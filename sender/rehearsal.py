@@ -11,9 +11,12 @@ from common.geometry.camera_model import Camera
 from common.runtime.clock import MonotonicClock
 from common.runtime.stage_timer import StageTimer
 from sender.capture.frame_set import DepthFrame, FrameSet
+from sender.capture.outside_skeleton import OutsideSkeleton, Sensor
 from sender.config import CandidateSettings
 from sender.fitting.body_model import BodyModel
 from sender.fitting.gauss_newton_tracker import GaussNewtonSettings, GaussNewtonTracker
+from sender.fitting.outside_joints import sensor_joints
+from sender.fitting.outside_tracker import OutsideTracker
 from sender.fitting.particle_tracker import ParticleSettings, ParticleTracker
 from sender.fitting.tracker import FitResult
 from sender.pipeline import CandidatePath, SkeletonPath, StreamIdentity, TrackedFrame
@@ -74,9 +77,19 @@ def rehearse_candidates() -> None:
         candidates.process(tracked)
 
 
+def rehearse_skeletons() -> None:
+    """Turn a skeleton of a sensor's own into ours."""
+    skeleton, pose = mannequin()
+    joints = sensor_joints(skeleton, pose, "kinect-v2").astype(np.float32)
+    tracker = OutsideTracker("kinect-v2", [Sensor("sensor", (0.0, 1.0, 2.0))])
+    for index in range(2):
+        tracker.track((OutsideSkeleton(index * FRAME_NS, 0, joints, np.ones(len(joints), np.float32)),))
+
+
 def rehearse_all() -> None:
     """What a sender does from the first frame on."""
     rehearse_fitting()
+    rehearse_skeletons()
     rehearse_candidates()
 
 

@@ -63,7 +63,9 @@ class CaptureThread:
         frame = self._source.read(READ_TIMEOUT_S)
         now_ns = self._clock.now_ns()
         sets = self._synchronizer.expire(now_ns)
-        if frame is not None:
+        if isinstance(frame, FrameSet):  # of skeletons, which their source has synchronised
+            sets.append(frame)
+        elif frame is not None:
             self.frames += 1
             sets += self._synchronizer.push(frame, now_ns)
         for frame_set in sets:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from common.geometry.camera_model import Camera
+from sender.capture.outside_skeleton import Instant
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -58,17 +59,20 @@ Frame = DepthFrame | ColourFrame
 class FrameSet:
     """All cameras at one instant; ``frames[i]`` is camera i's frame or None when it is missing.
 
-    ``capture_ns``: the instant (median of the members' capture times) [ns].
+    ``capture_ns``: the instant (median of the members' capture times) [ns]. ``skeletons``: found by the
+    sensors' own software, in place of frames.
     """
 
     capture_ns: int
     frames: tuple[Frame | None, ...]
+    skeletons: Instant = ()
 
 
 class FrameSource(Protocol):
     """Where frames come from: virtual rig, recording, later live cameras.
 
-    ``read`` blocks up to ``timeout_s`` for the next frame of any camera and returns None when none came in time;
+    ``read`` blocks up to ``timeout_s`` for the next frame of any camera and returns None when none came in time; a
+    source of skeletons, without cameras, returns a whole set;
     it raises ``EndOfFrames`` when there will be no more and ``CaptureError`` when the source broke.
     ``has_depth``: whether its frames are ``DepthFrame``s; else they are ``ColourFrame``s.
     ``empty_room`` shows each camera's view without a person, where the source has it: the depth (H, W) uint16 mm, or
@@ -87,7 +91,7 @@ class FrameSource(Protocol):
     def frame_rate_hz(self) -> float: ...
     @property
     def start_joints(self) -> NDArray[np.floating] | None: ...
-    def read(self, timeout_s: float) -> Frame | None: ...
+    def read(self, timeout_s: float) -> Frame | FrameSet | None: ...
     def close(self) -> None: ...
 
 

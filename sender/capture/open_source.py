@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from sender.capture.frame_set import FrameSource
 from sender.capture.recorded_rig import RecordedRig
+from sender.capture.recorded_skeletons import RecordedSkeletons
 from sender.capture.rig_layout import RigSettings
+from sender.capture.skeleton_recording import SUFFIXES
 from sender.capture.virtual_rig import VirtualRig
 from sender.config import CaptureSettings
 
@@ -17,6 +19,8 @@ def open_source(settings: CaptureSettings) -> FrameSource:
     """
     if settings.source == "recording":
         assert settings.recording is not None  # the settings were checked
+        if settings.recording.suffix in SUFFIXES:
+            return RecordedSkeletons.open(settings.recording, settings.realtime, settings.loop)
         return RecordedRig.open(settings.recording, settings.realtime, settings.loop)
     if settings.source == "rig":
         assert settings.rig_socket is not None

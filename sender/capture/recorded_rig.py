@@ -127,7 +127,7 @@ class RecordedRig:
         while self._decoding:
             time_ns, camera, sequence, images = self._decoding[0]
             capture_ns = self._start_ns + time_ns
-            if self._realtime and not _sleep_until(capture_ns, deadline_ns):
+            if self._realtime and not sleep_until(capture_ns, deadline_ns):
                 return None
             self._decoding.popleft()
             self._decode_ahead()
@@ -172,7 +172,7 @@ class RecordedRig:
             repetition += 1
 
 
-def _sleep_until(time_ns: int, deadline_ns: int) -> bool:
+def sleep_until(time_ns: int, deadline_ns: int) -> bool:
     """Sleep until ``time_ns``, or only until the deadline if that is earlier; whether the time has come."""
     wait_ns = min(time_ns, deadline_ns) - time.monotonic_ns()
     if wait_ns > 0:

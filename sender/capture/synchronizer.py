@@ -42,7 +42,7 @@ class Synchronizer:
     """Sets of up to ``camera_count`` frames whose capture times differ by at most ``tolerance_ns`` from the first one.
 
     ``patience_ns``: how long after a set's first frame the others are waited for. ``shapes``: (height, width) of each
-    camera's images; frames of another shape are rejected.
+    camera's images; frames of another shape are rejected. Without cameras there is nothing to synchronise.
     """
 
     def __init__(
@@ -52,7 +52,7 @@ class Synchronizer:
         patience_ns: int,
         shapes: Sequence[tuple[int, int]] | None = None,
     ) -> None:
-        if camera_count < 1 or tolerance_ns < 0 or patience_ns < 0:
+        if camera_count < 0 or tolerance_ns < 0 or patience_ns < 0:
             raise ValueError(f"synchronizer: {camera_count} cameras, tolerance {tolerance_ns}, patience {patience_ns}")
         if shapes is not None and len(shapes) != camera_count:
             raise ValueError(f"synchronizer: {len(shapes)} image shapes for {camera_count} cameras")
