@@ -43,7 +43,7 @@ class Motion:
     joints: Floats
 
     def residuals_mm(self) -> Floats:
-        """(F', J) distances from the line between the neighbours in time, over the factor by which they spread noise."""
+        """(F', J) distances from the line between the neighbours in time, scaled to the noise of one position."""
         steps = np.diff(self.times_s)
         near = (steps[:-1] < GAP_S) & (steps[1:] < GAP_S)
         share = (steps[:-1] / (steps[:-1] + steps[1:]))[:, None, None]
@@ -111,7 +111,7 @@ def _angle(case: str, recording: SkeletonRecording, seconds: float | None) -> li
 
 def _motion(frames: list[tuple[int, NDArray[np.floating]]]) -> Motion:
     """Frames in order of time; of repeated ones the first."""
-    first = {time_ns: joints for time_ns, joints in reversed(frames)}
+    first = dict(reversed(frames))
     times_ns = sorted(first)
     return Motion(np.array(times_ns) * 1e-9, np.array([first[time_ns] for time_ns in times_ns], np.float64))
 

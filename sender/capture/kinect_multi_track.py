@@ -59,13 +59,25 @@ def read_multi_track(lines: Iterable[str]) -> SkeletonRecording:
         joints = transform_points(T_world_reference, row.joints).astype(np.float32)
         return OutsideSkeleton(capture_ns, names.index(row.sensor), joints, np.ones(len(joints), np.float32))
 
-    instants = []
-    for _, together in groupby(rows, key=lambda row: row.tracker_ms):
-        latest = {row.sensor: row for row in together}
-        instants.append(tuple(skeleton(latest[name]) for name in names if name in latest))
+    instants = [tuple(skeleton(row) for row in together) for together in _in_order(rows)]
     firsts = [next(row for row in rows if row.sensor == name) for name in names]
     sensors = tuple(_placed(first, rows[0], T_world_reference) for first in firsts)
     return SkeletonRecording("kinect-v2", sensors, _RATE_HZ, tuple(instants))
+
+
+def _in_order(rows: list[_Row]) -> Iterator[list[_Row]]:
+    """The rows that belong together, by sensor. Now and then the tables give an older skeleton after a newer one: then
+    the newer one still counts, and where that is all, there is nothing new."""
+    newest: dict[str, _Row] = {}
+    for _, group in groupby(rows, key=lambda row: row.tracker_ms):
+        together = {row.sensor: row for row in group}
+        news = False
+        for name, row in together.items():
+            news = news or name not in newest or row.skeleton_ticks > newest[name].skeleton_ticks
+            if name not in newest or row.skeleton_ticks > newest[name].skeleton_ticks:
+                newest[name] = row
+        if news:
+            yield [newest[name] for name in sorted(together)]
 
 
 def _origin_under(first: _Row) -> Floats:
