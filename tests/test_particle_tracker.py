@@ -89,7 +89,7 @@ def test_an_arm_that_nothing_shows_is_not_sure() -> None:
     seen, _ = followed(tracker, True, 4)
     hidden = tracker.track(cloud_of(pose_at(4 / 30), True, LEFT_ARM), 4 * FRAME_NS)
     assert hidden is not None
-    others = links_of(tuple(f"{side}_{part}" for side in SIDES for part in ("thigh", "shin")) + ("right_upper_arm",))
+    others = links_of((*(f"{side}_{part}" for side in SIDES for part in ("thigh", "shin")), "right_upper_arm"))
     assert hidden.pose.confidence[links_of(LEFT_ARM)].max() < 0.3 < seen.pose.confidence[links_of(LEFT_ARM)].min()
     assert hidden.pose.confidence[others].min() > 0.5
 

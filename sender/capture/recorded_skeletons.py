@@ -23,6 +23,7 @@ class RecordedSkeletons:
     cameras: tuple[Camera, ...] = ()
     empty_room: tuple[NDArray[np.uint16] | None, ...] = ()
     start_joints: NDArray[np.floating] | None = None
+    has_depth = False
 
     def __init__(self, recording: SkeletonRecording, realtime: bool = True, loop: bool = False) -> None:
         self.recording = recording

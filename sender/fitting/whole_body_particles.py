@@ -86,7 +86,7 @@ class Part:
             directions=turned @ R[links] @ self._ellipsoids.directions[self.rows],
             axes=scale * self._ellipsoids.axes[self.rows],
         )
-        return body, T_world_parent
+        return body, T_world_parent.astype(np.float64)
 
 
 class WholeBodyParticles:
