@@ -33,7 +33,7 @@ class AnnealingSettings:
     layers: int = 3
     survivors: float = 0.5
     smoothing: float = 0.5
-    noise_shrink: float = 0.5
+    noise_shrink: float = 0.6
     selection: Literal["deterministic", "random"] = "deterministic"
     crossover: float = 0.0
 

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from common.body.skeleton import LINK_INDEX, LINK_NAMES, LINK_PARENTS, SIDES, Skeleton
 from common.geometry import quaternion
-from sender.fitting.joint_limits import rotation_exp, swing_twist_angles
+from sender.fitting.joint_limits import joint_table, rotation_exp, swing_twist_angles
 
 Array = NDArray[Any]
 Floats = NDArray[np.float64]
@@ -42,6 +42,7 @@ _JOINTS: dict[str, tuple[tuple[int, ...], int]] = {
 # A swing vector is singular half a turn away from its zero; this is where the left arm points at zero, so that the
 # singular direction lies behind the other shoulder.
 _LEFT_ARM_ZERO = np.array([0.5, -0.7, 0.5])
+_LIMITS = joint_table()
 _WITHOUT_ELLIPSOID = ("neck", "clavicle")
 
 LEGS = tuple(f"{side}_{part}" for side in SIDES for part in ("thigh", "shin", "foot"))
@@ -64,7 +65,7 @@ class EllipsoidBody:
     transform given from outside carries it. ``offsets`` (K, 3) [m]: joint in the parent's frame. ``zero`` (K, 3, 3):
     rotation relative to the parent when all angles are 0. ``twist_axis`` (K,).
     ``dof_link, dof_axis`` (D,): row and axis of each degree of freedom: 0..2 an angle [rad] as in ``joint_limits``,
-    3..5 a shift of the joint along its parent's axes [m].
+    3..5 a shift of the joint along its parent's axes [m]. ``low, high`` (D,): limits, infinite where none is set.
     ``ellipsoid_link`` (E,): row of the link each ellipsoid is fixed to; ``centres`` (E, 3) [m] and ``directions``
     (E, 3, 3) (columns: the principal directions) in the link's frame; ``axes`` (E, 3) [m]: the semi-axes.
     """
@@ -76,6 +77,8 @@ class EllipsoidBody:
     twist_axis: Array
     dof_link: Array
     dof_axis: Array
+    low: Floats
+    high: Floats
     ellipsoid_link: Array
     centres: Floats
     directions: Floats
@@ -118,11 +121,23 @@ def ellipsoid_body(skeleton: Skeleton, names: tuple[str, ...]) -> EllipsoidBody:
         twist_axis=np.array([_JOINTS[part][1] for part in parts]),
         dof_link=np.array([row for row, _ in free]),
         dof_axis=np.array([axis for _, axis in free]),
+        low=np.array([_limits(names[row], axis)[0] for row, axis in free]),
+        high=np.array([_limits(names[row], axis)[1] for row, axis in free]),
         ellipsoid_link=np.array(carrying),
         centres=np.stack([centre for centre, _, _ in shapes]),
         directions=np.stack([directions for _, directions, _ in shapes]),
         axes=np.stack([axes for _, _, axes in shapes]),
     )
+
+
+def _limits(name: str, axis: int) -> tuple[float, float]:
+    """As in ``joint_limits``, for hinges and for the twist of an arm: there a joint bent the wrong way, or half a turn
+    of twist, is another posture with nearly the same score."""
+    hinge = len(_JOINTS[name.partition("_")[2]][0]) == 1 if name.startswith(SIDES) else False
+    if hinge or (name.endswith("upper_arm") and axis == X):
+        link = LINK_INDEX[name]
+        return float(_LIMITS.low[link, axis]), float(_LIMITS.high[link, axis])
+    return -np.inf, np.inf
 
 
 def _zero(name: str) -> Floats:
