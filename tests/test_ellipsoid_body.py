@@ -32,7 +32,7 @@ def random_pose(seed: int) -> np.ndarray:
 
 @pytest.mark.parametrize(
     ("names", "dofs", "ellipsoids"),
-    [(LEGS, 10, 6), (arm_links("left"), 4, 2), (arm_links("right"), 4, 2), (TORSO, 12, 4), (WHOLE_BODY, 30, 14)],
+    [(LEGS, 10, 6), (arm_links("left"), 4, 2), (arm_links("right"), 4, 2), (TORSO, 12, 4), (WHOLE_BODY, 30, 16)],
 )
 def test_limbs_have_the_published_degrees_of_freedom(names: tuple[str, ...], dofs: int, ellipsoids: int) -> None:
     body = ellipsoid_body(SKELETON, names)
@@ -95,7 +95,7 @@ def test_quadrics_map_every_ellipsoid_to_the_unit_ball() -> None:
     T_parent = random_pose(2)[0]
     particles = 0.4 * np.random.default_rng(3).standard_normal((2, body.dof_count))
     T, Q = link_transforms(body, particles, T_parent), quadrics(body, particles, T_parent)
-    for p, e in ((0, 0), (1, 5), (1, 13)):
+    for p, e in ((0, 0), (1, 5), (1, 15)):
         link = T[p, body.ellipsoid_link[e]]
         for axis in range(3):
             tip = body.centres[e] + body.directions[e][:, axis] * body.axes[e, axis]
@@ -109,6 +109,24 @@ def test_an_ellipsoid_lies_along_its_bone() -> None:
     np.testing.assert_allclose(np.abs(body.directions[shin][:, 1]), [0, 1, 0], atol=1e-6)
     assert body.axes[shin, 1] > 3 * body.axes[shin, 0]
     np.testing.assert_allclose(body.scaled(1.2).axes, 1.2 * body.axes)
+
+
+def test_only_hinges_and_the_twist_of_an_arm_have_limits() -> None:
+    body = ellipsoid_body(SKELETON, WHOLE_BODY)
+    limited = {name for name, low, high in zip(body.dof_names(), body.low, body.high, strict=True) if low > -np.inf}
+    assert limited == {
+        f"{side}_{dof}" for side in ("left", "right") for dof in ("shin.x", "foot.x", "upper_arm.x", "forearm.y")
+    }
+    at = dict(zip(body.dof_names(), zip(body.low, body.high, strict=True), strict=True))
+    assert at["left_forearm.y"][0] == pytest.approx(-at["right_forearm.y"][1])  # elbows bend towards each other
+
+
+def test_a_hand_goes_on_from_the_wrist_to_the_fingertips() -> None:
+    body = ellipsoid_body(SKELETON, WHOLE_BODY)
+    e = [LINK_NAMES[body.links[row]] for row in body.ellipsoid_link].index("left_hand")
+    length = np.linalg.norm(SKELETON.tips[[LINK_INDEX["left_hand"], LINK_INDEX["left_fingers"]]], axis=1).sum()
+    assert 2 * body.axes[e, 1] == pytest.approx(length, rel=0.3)
+    np.testing.assert_allclose(body.centres[e], [length / 2, 0, 0], atol=1e-6)
 
 
 def test_quaternions_of_zero_are_proper() -> None:

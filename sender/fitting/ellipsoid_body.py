@@ -1,6 +1,7 @@
 """Limbs as ellipsoids that joint angles move (Rao & Hodges §5, Fig. 2 a): the model the particle filters fit.
 
-Legs: 10 degrees of freedom, 6 ellipsoids. An arm: 4 and 2. Torso with head: 12 and 4, among them the root's position.
+Legs: 10 degrees of freedom, 6 ellipsoids. An arm: 4 and 2. Torso with head: 12 and 4, among them the root's position;
+the whole body, hands on stiff wrists: 30 and 16.
 The transform of the link that carries the limb is given (pelvis for legs, clavicle for an arm, the world for a torso).
 A link turns by ``zero · swing · twist``: the twist about its bone, the swing a rotation vector across it; a hinge is a
 joint with only one of the three angles free.
@@ -35,6 +36,7 @@ _JOINTS: dict[str, tuple[tuple[int, ...], int]] = {
     "clavicle": ((), X),
     "upper_arm": (_TURNS, X),
     "forearm": ((Y,), X),
+    "hand": ((), X),
     "thigh": (_TURNS, Y),
     "shin": ((X,), Y),
     "foot": ((X,), Y),
@@ -43,6 +45,7 @@ _JOINTS: dict[str, tuple[tuple[int, ...], int]] = {
 # singular direction lies behind the other shoulder.
 _LEFT_ARM_ZERO = np.array([0.5, -0.7, 0.5])
 _LIMITS = joint_table()
+_ENDS = {"hand": "fingers", "foot": "toes"}  # one ellipsoid for both
 _WITHOUT_ELLIPSOID = ("neck", "clavicle")
 
 LEGS = tuple(f"{side}_{part}" for side in SIDES for part in ("thigh", "shin", "foot"))
@@ -54,7 +57,11 @@ def arm_links(side: str) -> tuple[str, ...]:
     return f"{side}_upper_arm", f"{side}_forearm"
 
 
-WHOLE_BODY = (*TORSO, *(link for side in SIDES for link in (f"{side}_clavicle", *arm_links(side))), *LEGS)
+def _whole_arm(side: str) -> tuple[str, ...]:
+    return f"{side}_clavicle", *arm_links(side), f"{side}_hand"
+
+
+WHOLE_BODY = (*TORSO, *_whole_arm("left"), *_whole_arm("right"), *LEGS)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -151,9 +158,11 @@ def _ellipsoid(skeleton: Skeleton, link: int) -> tuple[Floats, Floats, Floats]:
     """Centre, directions and semi-axes in the link's frame; the second direction lies along the bone."""
     start, end = np.zeros(3), skeleton.tips[link].astype(np.float64)
     radius = float(skeleton.radii[link])
-    if LINK_NAMES[link].endswith("foot"):  # from the heel to the tip of the toes
-        end = end + skeleton.tips[LINK_INDEX[LINK_NAMES[link].replace("foot", "toes")]]
-        start = np.array([0.0, end[1], -radius])
+    side, _, part = LINK_NAMES[link].partition("_")
+    if part in _ENDS:
+        end = end + skeleton.tips[LINK_INDEX[f"{side}_{_ENDS[part]}"]]
+    if part == "foot":
+        start = np.array([0.0, end[1], -radius])  # the heel
     length = float(np.linalg.norm(end - start))
     directions = quaternion.to_matrix(quaternion.shortest_arc(np.array([0.0, 1.0, 0.0]), end - start))
     return (start + end) / 2, np.asarray(directions), np.array([radius, length / 2 + radius / 2, radius])
