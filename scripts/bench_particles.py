@@ -189,9 +189,9 @@ class _Noises:
     def _of(self, clip: str, limb: Limb) -> Array:
         if clip not in self._tracks:
             assert self._data is not None
-            body = load_body(min((self._data / "bodies").glob("*.npz")))
-            track = retarget(body, read_clip(self._data / "mocap", clip))
-            self._tracks[clip] = linked_body(body, track), track
+            skinned = load_body(min((self._data / "bodies").glob("*.npz")))
+            track = retarget(skinned, read_clip(self._data / "mocap", clip))
+            self._tracks[clip] = linked_body(skinned, track), track
         linked, track = self._tracks[clip]
         body = ellipsoid_body(linked.skeleton, limb.links)
         return np.array([_truth(linked, body, limb, T)[1] for T in posed_joints(linked.body, track, 30, None)])

@@ -92,7 +92,7 @@ def linked_body(body: SkinnedBody, track: PoseTrack) -> LinkedBody:
 
 
 def _hinge_axis(local: Floats) -> Floats:
-    """Unit axis (3,), upwards, about which local rotations (F, 4) turn: of the widest turn between any and the first."""
+    """Unit axis (3,), upwards, about which local rotations (F, 4) turn: of the widest turn from the first."""
     turns = quaternion.to_rotation_vector(quaternion.multiply(local, quaternion.conjugate(local[0])))
     widest = turns[np.linalg.norm(turns, axis=1).argmax()]
     return np.asarray(widest / np.linalg.norm(widest) * (1 if widest[1] > 0 else -1))

@@ -76,3 +76,24 @@ def test_expected_shares_lower_the_weight_by_what_is_missing() -> None:
     claimed = np.array([[30, 10], [40, 0], [0, 40]], np.float32)
     weights = weights_of(claimed, 50, np.array([0.3, 0.3], np.float32))
     np.testing.assert_allclose(weights, [0.8 * 0.9, 0.8 * 0.7, 0.8 * 0.7], rtol=1e-6)
+
+
+def test_a_limb_hidden_in_the_torso_wins_one_sided_and_loses_two_sided() -> None:
+    """Two arms side by side before a torso that is not quite an ellipsoid. One arm can hold the points of both; the
+    other then does better in the torso, where it picks up points the torso's ellipsoid leaves over."""
+    random = np.random.default_rng(5)
+    unit = random.standard_normal((2600, 3))
+    unit /= np.linalg.norm(unit, axis=1, keepdims=True)
+    torso = unit[:2000] * [0.16, 0.32, 0.12] * random.uniform(0.93, 1.04, (2000, 1))
+    arms = [unit[2000 + 300 * k : 2300 + 300 * k] * [0.035, 0.13, 0.035] + [0.02 * k, 0, 0.25] for k in (0, 1)]
+    points = np.concatenate([torso, *arms]).astype(np.float32)
+    arm = (0.05, 0.15, 0.05)
+    in_place = ball(arm, (0, 0, 0.25)), ball(arm, (0.02, 0, 0.25))
+    hidden = ball(arm, (0.01, 0, 0.25)), ball(arm, (0.05, 0.1, 0.09))
+    body = ball((0.16, 0.32, 0.12))
+    Q = np.concatenate([np.concatenate([body, *pose], axis=1) for pose in (in_place, hidden)])
+    one_sided = numba_weights(points, Q, np.zeros(3, np.float32))
+    expected = 0.7 * np.array([0.5, 0.1, 0.1], np.float32)
+    two_sided = numba_weights(points, Q, expected)
+    assert one_sided[1] > one_sided[0]
+    assert two_sided[0] > two_sided[1]

@@ -1,8 +1,9 @@
 """Particles brought onto the cloud by Gauss–Newton on the points' distances to the ellipsoids.
 
-An annealed filter's particles come near the pose and stop at the spread of its last layer. A few steps of least squares
-from the best of them find the pose itself. A point belongs to the ellipsoid whose surface is nearest, with a first-order
-distance and a Geman–McClure weight; each ellipsoid sums 6×6 normal equations, which are projected on the angles.
+An annealed filter's particles come near the pose and stop at the spread of its last layer. A few steps of least
+squares from the best of them find the pose itself. A point belongs to the ellipsoid whose surface is nearest, with a
+first-order distance and a Geman–McClure weight; each ellipsoid sums 6×6 normal equations, which are projected on the
+angles.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ def polished(
     body: EllipsoidBody, points: Array, particles: Floats, T_world_parent: Floats, plan: Polish
 ) -> tuple[Floats, Floats]:
     """``particles`` (P, D) after ``plan.steps`` steps each, and their mean robust costs (P,), 0 (every point on the
-    surface) .. 1. ``points`` (N, 3) [m, world]; ``body``: ellipsoids that are the surface, hinges kept within limits."""
+    surface) .. 1. ``points`` (N, 3) [m, world]; ``body``: ellipsoids that are the surface; its limits are kept."""
     count, D = particles.shape
     H, g = np.empty((count, len(body.axes), 6, 6)), np.empty((count, len(body.axes), 6))
     costs = np.empty(count)

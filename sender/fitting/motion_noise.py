@@ -2,7 +2,7 @@
 
 σ of a degree of freedom at the top layer is a third of its largest change from frame to frame. It depends on the time
 between frames, so the table holds several. Learned from motion capture where there is some; the default reads the
-joint table's own steps as the largest changes, up to the joint's whole range.
+joint table's own steps as the largest changes, and lets them grow with the root of the time: limbs turn back.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ def learned_noise(clips: Sequence[Floats]) -> MotionNoise:
 
 
 def default_noise(body: EllipsoidBody) -> MotionNoise:
-    """From ``joint_limits``: a third of the step per 1/30 s, growing with the root of the time up to a third of the range."""
+    """From ``joint_limits``: a third of the step per 1/30 s times the root of the time, at most of the range."""
     table = joint_table()
     links, axes = body.links[body.dof_link], body.dof_axis
     turns, angle = axes < 3, np.minimum(axes, 2)
