@@ -42,7 +42,7 @@ class LimbSettings:
 
 PUBLISHED = LimbSettings(AnnealingSettings(), expected=0.0, finalists=0, weighed=1 << 24, polished=0)
 IMPROVED = LimbSettings(AnnealingSettings(particles=200), expected=0.7, finalists=4, weighed=1000, polished=1000)
-_COARSE, _FINE, _AS_IT_IS = Polish(steps=4), Polish(steps=3), Polish(steps=0)
+_COARSE, _FINE, _AS_IT_IS = Polish(steps=5, sigma_m=0.08), Polish(steps=3), Polish(steps=0)
 BAD = 1.3  # times the cost at the start: not the pose, so the search is repeated, wider and from both
 SECOND_SEARCH = 1.5
 
