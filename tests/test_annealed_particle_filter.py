@@ -44,7 +44,8 @@ def hill(particles: np.ndarray) -> np.ndarray:
 
 
 def test_annealing_climbs_the_hill_with_noise_that_shrinks_layer_by_layer() -> None:
-    found = anneal(np.zeros(3), np.full(3, 0.2), hill, AnnealingSettings(), np.random.default_rng(2))
+    settings = AnnealingSettings(noise_shrink=0.5)
+    found = anneal(np.zeros(3), np.full(3, 0.2), hill, settings, np.random.default_rng(2))
     assert np.linalg.norm(found.pose - [0.3, -0.2, 0.1]) < 0.12
     assert len(found.layers) == 3
     added = [b.particles - a.particles[a.selected] for a, b in zip(found.layers, found.layers[1:], strict=False)]

@@ -109,6 +109,24 @@ def test_time_that_runs_backwards_or_stands_still_is_survived() -> None:
     assert np.degrees(np.abs(fit.particle - walking(0))).mean() < 10.0
 
 
+def test_a_jump_is_searched_a_second_time_and_found() -> None:
+    searched: list[int] = []
+
+    def spy(points: np.ndarray, quadrics: np.ndarray, expected: np.ndarray) -> np.ndarray:
+        searched.append(len(quadrics))
+        return numba_weights(points, quadrics, expected)
+
+    tracker = LimbTracker(BODY, default_noise(BODY), IMPROVED, weights=spy)
+    tracker.start_from(surface_cloud(BODY, walking(0), pelvis(0), 150), walking(0), pelvis(0), 0)
+    tracker.track(surface_cloud(BODY, walking(0), pelvis(0), 150, seed=1), pelvis(0), FRAME_NS)
+    assert len(searched) == 3
+    jumped = walking(0) + np.radians([-100, 0, 20, 80, 0, 20, 0, -20, 70, 0])
+    for frame in range(2, 6):
+        fit = tracker.track(surface_cloud(BODY, jumped, pelvis(0), 150, seed=frame), pelvis(0), frame * FRAME_NS)
+    assert len(searched) > 3 + 4 * 3
+    assert np.degrees(np.abs(fit.particle - jumped)).mean() < 3.0
+
+
 @pytest.mark.parametrize("settings", [PUBLISHED, IMPROVED])
 def test_weights_come_from_the_device_that_was_chosen(settings: LimbSettings) -> None:
     asked: list[tuple[int, int, float]] = []

@@ -1,8 +1,9 @@
 """Follows legs or an arm with the annealed particle filter: as published (Rao & Hodges), and improved.
 
-The limb's root is known in every frame: the transform of the pelvis for legs, of the clavicle for an arm. The improved
-tracker scores both sides (an ellipsoid without its share of the points costs), takes more particles on fewer points,
-and brings the best of them onto the surface by Gauss–Newton.
+The limb's root is known in every frame: the transform of the pelvis for legs, of the clavicle for an arm. The points
+are the limb's own: those of the torso or the hand among them pull a polished pose off by degrees. The improved tracker
+scores both sides (an ellipsoid without its share of the points costs), takes more particles on fewer points, and brings
+the best of them onto the surface by Gauss–Newton, once more and wider where that does not reach it.
 """
 
 from __future__ import annotations
