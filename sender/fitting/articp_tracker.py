@@ -133,11 +133,11 @@ class ArticpTracker:
         assert self._person is not None
         person = self._person
         skeleton, pose, self._state = _pose_of(person.skeleton, state, self._settings.articulation)
-        near = _near_partner(person.model, self._state, tree, _near_m(len(cloud)))
+        near = _has_partner(person.model, self._state, tree, _near_m(len(cloud)))
         links = [near[person.model.rows(link)] for link in range(LINK_COUNT)]
         share = np.array([link.mean() if len(link) else 0.0 for link in links])
-        explained = _distances_to_model(cloud, person.model, self._state)
-        inlier = explained < _near_m(len(near))
+        explained = _distances_to_model(cloud, person.model, self._state, _near_m(len(near)))
+        inlier = np.isfinite(explained)
         confidence = float(near.mean() * inlier.mean())
         self._status = "tracking"
         if confidence >= self._settings.lost_confidence:
@@ -200,16 +200,18 @@ def _near_m(count: int) -> float:
     return NEAR_M + float(np.sqrt(SKIN_M2 / max(count, 1)))
 
 
-def _near_partner(model: LinkPoints, state: LinkState, tree: ClusteredKdTree, near_m: float) -> Array:
+def _has_partner(model: LinkPoints, state: LinkState, tree: ClusteredKdTree, near_m: float) -> Array:
     """Which model points (M,) bool have a partner in the cloud within ``near_m`` [m]."""
     points, normals = model.posed(state)
-    return np.asarray(partner_distances(points, normals, model.colours, tree) < near_m)
+    return np.isfinite(partner_distances(points, normals, model.colours, tree, near_m))
 
 
-def _distances_to_model(cloud: PointCloud, model: LinkPoints, state: LinkState) -> Array:
-    """Distances (≤ JUDGED_POINTS,) [m] of some of the cloud's points to the posed model's nearest point."""
+def _distances_to_model(cloud: PointCloud, model: LinkPoints, state: LinkState, near_m: float) -> Array:
+    """Distances (≤ JUDGED_POINTS,) [m] of some of the cloud's points to the posed model's nearest point, infinity
+    where it is not within ``near_m``."""
     points, normals = model.posed(state)
     posed = PointCloud(points.astype(np.float32), normals.astype(np.float32), np.zeros(points.shape, np.uint8))
+    tree = build_clustered_tree(posed, ONE_CLUSTER)
     every = slice(None, None, -(-len(cloud) // JUDGED_POINTS))
     some, at = cloud.positions[every].astype(np.float64), cloud.normals[every].astype(np.float64)
-    return partner_distances(some, at, np.zeros(len(some), np.int64), build_clustered_tree(posed, ONE_CLUSTER))
+    return partner_distances(some, at, np.zeros(len(some), np.int64), tree, near_m)

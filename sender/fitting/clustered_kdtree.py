@@ -121,14 +121,11 @@ def normal_cells(normals: Array, latitudes: int, longitudes: int) -> Array:
 
 @njit(nogil=True, cache=True, error_model="numpy")
 def nearest(
-    tree: ClusteredKdTree, cluster: int, p: Array, known: int, stack: Array, bounds: Array
+    tree: ClusteredKdTree, cluster: int, p: Array, best: int, least: float, stack: Array, bounds: Array
 ) -> tuple[int, float]:
     """Row of ``tree.points`` nearest to ``p`` (3,) [m, world] among the neighbours of ``cluster``, and its squared
-    distance [m²]; -1 and infinity when they hold no point. ``known``: a row among them, to search within its distance
-    (-1: none). ``stack`` (STACK, 2) int64 and ``bounds`` (STACK,) float64 are working space."""
-    best, least = known, np.inf
-    if known >= 0:
-        least = _squared_distance(tree.points, known, p)
+    distance [m²]. ``best, least``: a row known already and its squared distance, or -1 and how far to look (squared):
+    they come back when nothing is nearer. ``stack`` (STACK, 2) int64 and ``bounds`` (STACK,) are working space."""
     for k in range(tree.first_neighbour[cluster], tree.first_neighbour[cluster + 1]):
         candidate = tree.neighbours[k]
         to_box = 0.0
@@ -146,7 +143,7 @@ def nearest(
                 continue
             while end - begin > LEAF:  # down to the leaf on p's side, the other sides wait
                 middle = (begin + end) // 2
-                squared = _squared_distance(tree.points, middle, p)
+                squared = squared_distance(tree.points, middle, p)
                 if squared < least:
                     best, least = middle, squared
                 beyond = p[tree.axis[middle]] - tree.points[middle, tree.axis[middle]]
@@ -157,14 +154,14 @@ def nearest(
                     stack[size, 0], stack[size, 1], begin = begin, middle, middle + 1
                 size += 1
             for row in range(begin, end):
-                squared = _squared_distance(tree.points, row, p)
+                squared = squared_distance(tree.points, row, p)
                 if squared < least:
                     best, least = row, squared
     return best, least
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
-def _squared_distance(points: Array, row: int, p: Array) -> float:
+def squared_distance(points: Array, row: int, p: Array) -> float:
     x, y, z = points[row, 0] - p[0], points[row, 1] - p[1], points[row, 2] - p[2]
     squared: float = x * x + y * y + z * z
     return squared
@@ -228,7 +225,7 @@ def _select(positions: Array, order: Array, begin: int, end: int, middle: int, a
 
 @cache
 def _neighbours(bins: ClusterBins) -> tuple[Array, Array]:
-    """Rows and starts (K + 1,) of the clusters that each cluster is searched in, itself among them."""
+    """Clusters that each cluster is searched in, itself first, and where each list starts (K + 1,)."""
     colours = _ring_neighbours(bins.saturations - 1, bins.hues)
     normals = _band_neighbours(bins.latitudes, bins.longitudes)
     lists = [[n * bins.colour_cells + c for n in around for c in beside] for around in normals for beside in colours]

@@ -13,7 +13,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from sender.fitting.clustered_kdtree import STACK, ClusteredKdTree, nearest, normal_cells
+from sender.fitting.clustered_kdtree import STACK, ClusteredKdTree, nearest, normal_cells, squared_distance
 
 Array = NDArray[Any]
 
@@ -56,18 +56,20 @@ def fit_link(
     )
 
 
-def partner_distances(points: Array, normals: Array, colours: Array, tree: ClusteredKdTree) -> Array:
-    """Distances (M,) [m] to the points' partners; infinity without one. Arguments as for ``fit_link``."""
+def partner_distances(points: Array, normals: Array, colours: Array, tree: ClusteredKdTree, within_m: float) -> Array:
+    """Distances (M,) [m] to the points' partners; infinity where none is ``within_m``. The rest as for ``fit_link``."""
     cells = normal_cells(normals, tree.latitudes, tree.longitudes) * tree.colour_cells + colours
-    return np.asarray(_distances(points, cells, tree))
+    return np.asarray(_distances(points, cells, tree, within_m))
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
-def _distances(points: Array, cells: Array, tree: ClusteredKdTree) -> Array:
-    distances = np.empty(len(points))
+def _distances(points: Array, cells: Array, tree: ClusteredKdTree, within_m: float) -> Array:
+    distances = np.full(len(points), np.inf)
     stack, bounds = np.empty((STACK, 2), np.int64), np.empty(STACK)
     for m in range(len(points)):
-        distances[m] = np.sqrt(nearest(tree, cells[m], points[m], -1, stack, bounds)[1])
+        row, squared = nearest(tree, cells[m], points[m], -1, within_m**2, stack, bounds)
+        if row >= 0:
+            distances[m] = np.sqrt(squared)
     return distances
 
 
@@ -81,7 +83,9 @@ def _iterate(points, cells, joint, anchored, tree, tau_squared, stall_m, iterati
     for iteration in range(iterations):
         total, pairs = 0.0, 0
         for m in range(len(moved)):
-            partner[m], squared = nearest(tree, cells[m], moved[m], partner[m], stack, bounds)
+            known = partner[m]
+            squared = squared_distance(tree.points, known, moved[m]) if known >= 0 else np.inf
+            partner[m], squared = nearest(tree, cells[m], moved[m], known, squared, stack, bounds)
             if partner[m] >= 0:
                 total += squared
                 pairs += 1
