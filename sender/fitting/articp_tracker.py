@@ -17,7 +17,7 @@ from common.body.skeleton import LINK_COUNT, LINK_PARENTS, Skeleton
 from common.body.skeleton_pose import SkeletonPose, forward_kinematics
 from common.geometry import quaternion
 from common.geometry.point_cloud import PointCloud
-from sender.fitting.articp import CARRIER, LinkPoints, LinkState, articp, segmented
+from sender.fitting.articp import CARRIER, LinkPoints, LinkState, articp, carriers_of, segmented
 from sender.fitting.body_model import BodyModel
 from sender.fitting.clustered_kdtree import ClusterBins, ClusteredKdTree, build_clustered_tree
 from sender.fitting.global_fitting import GlobalFitting, LinkMoments, fit_globally, link_moments
@@ -30,6 +30,7 @@ Array = NDArray[Any]
 MINIMUM_POINTS = 40
 SKIN_M2 = 1.9  # of an adult: how far apart the points of a cloud lie
 NEAR_M = 0.02  # a good fit is within this and the points' own spacing
+ENOUGH = 0.5  # of the points a link had in the initial cloud: with fewer it is sure of less
 JUDGED_POINTS = 500  # of the cloud, for the share that the model explains
 ONE_CLUSTER = ClusterBins(1, 1, 1, 1)
 
@@ -133,20 +134,19 @@ class ArticpTracker:
         assert self._person is not None
         person = self._person
         skeleton, pose, self._state = _pose_of(person.skeleton, state, self._settings.articulation)
-        near = _has_partner(person.model, self._state, tree, _near_m(len(cloud)))
-        links = [near[person.model.rows(link)] for link in range(LINK_COUNT)]
-        share = np.array([link.mean() if len(link) else 0.0 for link in links])
-        explained = _distances_to_model(cloud, person.model, self._state, _near_m(len(near)))
+        share = _link_confidence(person, self._state, cloud, tree)
+        explained = _distances_to_model(cloud, person.model, self._state, _near_m(len(person.model.points)))
         inlier = np.isfinite(explained)
-        confidence = float(near.mean() * inlier.mean())
+        seen = float(np.average(share, weights=np.diff(person.model.first)))
+        confidence = seen * float(inlier.mean())
         self._status = "tracking"
         if confidence >= self._settings.lost_confidence:
             self._good_ns = capture_ns
         else:
-            self._status = f"unsure: {near.mean():.0%} of the model and {inlier.mean():.0%} of the points fit"
+            self._status = f"unsure: {seen:.0%} of the model and {inlier.mean():.0%} of the points fit"
         self._result = FitResult(
             skeleton=skeleton,
-            pose=SkeletonPose(pose.root_position, pose.rotations, share[CARRIER].astype(np.float32)),
+            pose=SkeletonPose(pose.root_position, pose.rotations, _down_the_tree(share)),
             converged=confidence >= self._settings.lost_confidence,
             iterations=iterations,
             inliers=float(inlier.mean()),
@@ -200,10 +200,25 @@ def _near_m(count: int) -> float:
     return NEAR_M + float(np.sqrt(SKIN_M2 / max(count, 1)))
 
 
-def _has_partner(model: LinkPoints, state: LinkState, tree: ClusteredKdTree, near_m: float) -> Array:
-    """Which model points (M,) bool have a partner in the cloud within ``near_m`` [m]."""
-    points, normals = model.posed(state)
-    return np.isfinite(partner_distances(points, normals, model.colours, tree, near_m))
+def _link_confidence(person: _Person, state: LinkState, cloud: PointCloud, tree: ClusteredKdTree) -> Array:
+    """For each link (L,) the share of its points with a partner near by, less where it claims too few of the cloud's
+    points: a limb out of sight folds onto what is there, and every one of its points finds a partner."""
+    points, normals = person.model.posed(state)
+    near = np.isfinite(partner_distances(points, normals, person.model.colours, tree, _near_m(len(cloud))))
+    counts = np.diff(person.model.first)
+    links = np.repeat(np.arange(LINK_COUNT), counts)
+    share = np.bincount(links, near, LINK_COUNT) / np.maximum(counts, 1)
+    claimed = np.bincount(carriers_of(cloud.positions, person.skeleton, state), minlength=LINK_COUNT)
+    usual = counts * len(cloud) / len(points)
+    return np.asarray(share * np.minimum(claimed / np.maximum(ENOUGH * usual, 1.0), 1.0))
+
+
+def _down_the_tree(share: Array) -> Array:
+    """Confidence (L,) float32 of all links: a link is no surer than the one it hangs from."""
+    confidence = share[CARRIER]
+    for link in range(1, LINK_COUNT):
+        confidence[link] = min(confidence[link], confidence[LINK_PARENTS[link]])
+    return np.asarray(confidence, np.float32)
 
 
 def _distances_to_model(cloud: PointCloud, model: LinkPoints, state: LinkState, near_m: float) -> Array:

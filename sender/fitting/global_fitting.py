@@ -24,7 +24,7 @@ class GlobalFitting:
     """``acceptable``: global error of a link (Eq. 4, as a share of μ(P_l)) up to which it is in S⁺. ``rounds``: ARTICP
     runs on S⁻ and Q⁻ at most."""
 
-    acceptable: float = 0.3
+    acceptable: float = 0.5
     rounds: int = 4
 
 
