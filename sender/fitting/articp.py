@@ -19,7 +19,7 @@ Array = NDArray[Any]
 
 # Links without a motion of their own, and the link that carries their points: the torso is one rigid link in the paper
 # (§5.1.1), and what has too few points of its own cannot be fitted alone.
-_CARRIED = {"lower_spine": "pelvis", "upper_spine": "pelvis", "neck": "head"} | {
+_CARRIED = {"lower_spine": "pelvis", "upper_spine": "pelvis", "head": "neck"} | {
     f"{side}_{part}": carrier
     for side in SIDES
     for part, carrier in (

@@ -62,7 +62,7 @@ class _Person:
     skeleton: Skeleton
     model: LinkPoints
     moments: LinkMoments
-    fitted: Array  # (L,) bool: the links with enough points of their own
+    fitted: Array  # (L,) bool: the links with points of their own
 
 
 class ArticpTracker:
@@ -87,7 +87,11 @@ class ArticpTracker:
         return None
 
     def start_from(self, skeleton: Skeleton, pose: SkeletonPose, cloud: PointCloud, capture_ns: int) -> FitResult:
-        """Starts with sizes and pose known from elsewhere and the cloud they belong to: the model (§5.1.1)."""
+        """Starts with sizes and pose known from elsewhere and the cloud they belong to: the model (§5.1.1). A cloud of
+        too few points is no model: the pose comes back at confidence 0, and the person is looked for."""
+        if len(cloud) < MINIMUM_POINTS:
+            self._status = f"{len(cloud)} points: nobody to start from"
+            return _untrusted(skeleton, pose)
         T = forward_kinematics(skeleton, pose).astype(np.float64)
         state = LinkState(T[:, :3, :3], np.ascontiguousarray(T[:, :3, 3]))
         self._person = _person_of(cloud, skeleton, state, self._settings)
@@ -101,11 +105,12 @@ class ArticpTracker:
             return self._unseen()
         if self._state is None or self._person is None:
             return self._look(cloud, capture_ns)
+        result = self._follow(self._person, self._state, cloud, capture_ns)
         if capture_ns - self._good_ns > self._settings.lost_s * 1e9:
             self._state = None
             self._status = "lost: looking for the person"
             return self._unseen()
-        return self._follow(self._person, self._state, cloud, capture_ns)
+        return result
 
     def _look(self, cloud: PointCloud, capture_ns: int) -> FitResult | None:
         found = find_initial_pose(cloud)
@@ -159,9 +164,7 @@ class ArticpTracker:
         """The last pose, not to be trusted; None when there never was one."""
         if self._result is None:
             return None
-        last = self._result
-        pose = SkeletonPose(last.pose.root_position, last.pose.rotations, np.zeros(LINK_COUNT, np.float32))
-        return FitResult(last.skeleton, pose, False, 0, 0.0, 0.0, 0.0)
+        return _untrusted(self._result.skeleton, self._result.pose)
 
 
 ARTICP_ABLATIONS: dict[str, Callable[[BodyModel | None], Tracker]] = {
@@ -194,6 +197,11 @@ def _pose_of(skeleton: Skeleton, state: LinkState, jointed: bool) -> tuple[Skele
     rotations = quaternion.from_matrix(local).astype(np.float32)
     pose = SkeletonPose(state.joints[0].astype(np.float32), rotations, np.ones(LINK_COUNT, np.float32))
     return skeleton, pose, LinkState(R, state.joints)
+
+
+def _untrusted(skeleton: Skeleton, pose: SkeletonPose) -> FitResult:
+    nothing_seen = SkeletonPose(pose.root_position, pose.rotations, np.zeros(LINK_COUNT, np.float32))
+    return FitResult(skeleton, nothing_seen, False, 0, 0.0, 0.0, 0.0)
 
 
 def _near_m(count: int) -> float:
