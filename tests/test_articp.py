@@ -285,6 +285,22 @@ def test_ablations_leave_out_what_their_names_say() -> None:
     assert errors["articp-no-constraints"] > 0.002
 
 
+def test_start_without_points_waits_for_some() -> None:
+    tracker = ArticpTracker(ArticpSettings())
+    fit = tracker.start_from(SKELETON, pose_at(0.0), nothing(1), 0)
+    assert (fit.confidence, fit.converged) == (0.0, False)
+    assert tracker.status == "1 points: nobody to start from"
+    assert tracker.track(nothing(500), FRAME_NS) is None
+    assert "looking for a person" in tracker.status
+
+
+def test_pause_is_not_a_loss() -> None:
+    tracker = started()
+    fit = tracker.track(cloud_at(1), 10 * 30 * FRAME_NS)
+    assert fit is not None
+    assert fit.converged
+
+
 def test_model_share_is_a_share() -> None:
     with pytest.raises(ValueError, match="model_share"):
         ArticpSettings(model_share=0.0)
