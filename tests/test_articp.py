@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from common.body.skeleton import LINK_COUNT, LINK_INDEX, LINK_PARENTS, NAMED_JOINT_LINKS
 from common.body.skeleton_pose import SkeletonPose, forward_kinematics, joint_positions, named_joint_positions
 from common.geometry.point_cloud import PointCloud
-from scripts.bench_tracking import surface_points
+from scripts.tracking_conditions import surface_points
 from sender.fitting.articp import CARRIER, DESCENDANTS, LinkPoints, LinkState, articp, carriers_of, segmented
 from sender.fitting.articp_tracker import ARTICP_ABLATIONS, ArticpSettings, ArticpTracker
 from sender.fitting.clustered_kdtree import ClusterBins, build_clustered_tree
