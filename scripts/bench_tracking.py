@@ -22,12 +22,13 @@ from scripts.run_bench import Row
 from scripts.tracking_conditions import condition, performer_for, sights
 from scripts.tracking_figures import save_all
 from scripts.tracking_run import Case, Result, flips_of, follow, is_clean
-from sender.fitting.open_tracker import TRACKERS, open_tracker
+from sender.fitting.open_tracker import TRACKERS
 
 DEFAULT_CONDITIONS = (
     "points-given,points-auto,depth4-auto,depth2-auto,depth1-auto,"
     "15fps-given,noise1cm-given,noise3cm-given,share5-given,share2-given"
 )
+CONTESTANTS = TRACKERS  # and ablations
 ROUTINE = "routine"  # the built-in performer's motion
 WARM_UP_S = 0.3
 _UNITS = {"time_to_skeleton_s": "s", "ms_per_frame_p50": "ms", "ms_per_frame_p99": "ms", "lost_share": "1"}
@@ -40,7 +41,7 @@ _REFERENCES = {
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """This bench's own options."""
-    parser.add_argument("--trackers", default="gauss-newton", help=f"of {', '.join(TRACKERS)}, separated by commas")
+    parser.add_argument("--trackers", default="gauss-newton", help=f"of {', '.join(CONTESTANTS)}, separated by commas")
     parser.add_argument("--conditions", default=DEFAULT_CONDITIONS, help="separated by commas")
     parser.add_argument("--bodies", default="", help="only these, separated by commas")
     parser.add_argument("--jobs", type=int, default=1, help="cases at a time, each in a process; times are noisy then")
@@ -63,7 +64,7 @@ def run(
             yield from _rows(result, jobs)
     yield from means(results, jobs)
     if pictures is not None:
-        save_all(results, open_tracker(cases[0].tracker), pictures)
+        save_all(results, CONTESTANTS[cases[0].tracker](None), pictures)
 
 
 def means(results: Iterable[Result], jobs: int = 1) -> Iterator[Row]:
@@ -106,7 +107,7 @@ def _cases(
     there = [] if data is None else list(json.loads((data / "mocap" / "clips.json").read_text()))
     persons = [] if data is None else sorted(path.stem for path in (data / "bodies").glob("*.npz"))
     _check("clip", clips, [ROUTINE, *there])
-    _check("tracker", trackers, TRACKERS)
+    _check("tracker", trackers, CONTESTANTS)
     _check("body", bodies, ["builtin", *persons])
     try:
         seen = [condition(name).name for name in conditions]
@@ -148,7 +149,7 @@ def _warm_up(trackers: list[str]) -> None:
 def _measure(case: Case) -> Result:
     seen = condition(case.condition)
     performer = performer_for(seen, case.body, None if case.clip == ROUTINE else case.clip, case.data)
-    run = follow(open_tracker(case.tracker), sights(performer, seen, case.seconds), seen.start == "given")
+    run = follow(CONTESTANTS[case.tracker](None), sights(performer, seen, case.seconds), seen.start == "given")
     metrics = run.metrics()
     if seen.start == "given":
         metrics.pop("time_to_skeleton_s", None)

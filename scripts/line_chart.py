@@ -8,7 +8,8 @@ from html import escape
 import numpy as np
 
 WIDTH, HEIGHT = 760, 340
-LEFT, RIGHT, TOP, BOTTOM = 64, 16, 40, 48  # room around the axes for their texts
+LEFT, RIGHT, TOP, BOTTOM = 64, 16, 56, 48  # room around the axes for their texts
+LETTER, GAP = 7.0, 18  # width of a letter, about; between names
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")  # told apart by everyone (Okabe & Ito)
 Line = tuple[Sequence[float], Sequence[float]]
 
@@ -51,14 +52,16 @@ def line_chart(
     parts.append(_text(14, (TOP + HEIGHT - BOTTOM) / 2, y_label, "middle", turned=True))
     if level is not None and level[1] <= y_range[1]:
         (x, y), end = place(x_range[0], level[1]), WIDTH - RIGHT
-        parts += [_stroke([(x, y), (end, y)], "#888", 1, dashed=True), _text(end, y - 4, level[0], "end")]
+        parts += [_stroke([(x, y), (end, y)], "#888", 1, dashed=True), _text(x + 4, y - 4, level[0], "start")]
+    name_x = float(LEFT)
     for number, (name, (line_x, line_y)) in enumerate(lines.items()):
         colour = COLOURS[number % len(COLOURS)]
         points = [place(x, y) for x, y in zip(line_x, line_y, strict=True)]
         parts.append(_stroke(points, colour, 1.6))
         if dots:
             parts += [f'<circle cx="{x:.1f}" cy="{y:.1f}" r="3" fill="{colour}"/>' for x, y in points]
-        parts.append(_text(WIDTH - RIGHT, 20 + 15 * number, name, "end", colour=colour, bold=True))
+        parts.append(_text(name_x, 40, name, "start", colour=colour, bold=True))
+        name_x += LETTER * len(name) + GAP
     head = f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {WIDTH} {HEIGHT}" font-family="sans-serif">'
     return "\n".join([head, f'<rect width="{WIDTH}" height="{HEIGHT}" fill="white"/>', *parts, "</svg>"]) + "\n"
 
