@@ -22,13 +22,14 @@ from scripts.run_bench import Row
 from scripts.tracking_conditions import condition, performer_for, sights
 from scripts.tracking_figures import save_all
 from scripts.tracking_run import Case, Result, flips_of, follow, is_clean
+from sender.fitting.articp_tracker import ARTICP_ABLATIONS
 from sender.fitting.open_tracker import TRACKERS
 
 DEFAULT_CONDITIONS = (
     "points-given,points-auto,depth4-auto,depth2-auto,depth1-auto,"
     "15fps-given,noise1cm-given,noise3cm-given,share5-given,share2-given"
 )
-CONTESTANTS = TRACKERS  # and ablations
+CONTESTANTS = {**TRACKERS, **ARTICP_ABLATIONS}
 ROUTINE = "routine"  # the built-in performer's motion
 WARM_UP_S = 0.3
 _UNITS = {"time_to_skeleton_s": "s", "ms_per_frame_p50": "ms", "ms_per_frame_p99": "ms", "lost_share": "1"}
