@@ -23,13 +23,14 @@ from scripts.tracking_conditions import condition, performer_for, sights
 from scripts.tracking_figures import save_all
 from scripts.tracking_run import Case, Result, flips_of, follow, is_clean
 from sender.fitting.articp_tracker import ARTICP_ABLATIONS
-from sender.fitting.open_tracker import TRACKERS
+from sender.fitting.open_tracker import TRACKERS, open_tracker
+from sender.fitting.tracker import Tracker
 
 DEFAULT_CONDITIONS = (
     "points-given,points-auto,depth4-auto,depth2-auto,depth1-auto,"
     "15fps-given,noise1cm-given,noise3cm-given,share5-given,share2-given"
 )
-CONTESTANTS = {**TRACKERS, **ARTICP_ABLATIONS}
+CONTESTANTS = (*TRACKERS, *ARTICP_ABLATIONS)
 ROUTINE = "routine"  # the built-in performer's motion
 WARM_UP_S = 0.3
 _UNITS = {"time_to_skeleton_s": "s", "ms_per_frame_p50": "ms", "ms_per_frame_p99": "ms", "lost_share": "1"}
@@ -65,7 +66,12 @@ def run(
             yield from _rows(result, jobs)
     yield from means(results, jobs)
     if pictures is not None:
-        save_all(results, CONTESTANTS[cases[0].tracker](None), pictures)
+        save_all(results, contestant(cases[0].tracker), pictures)
+
+
+def contestant(name: str) -> Tracker:
+    """A tracker, or one with parts switched off, by its name in ``CONTESTANTS``."""
+    return ARTICP_ABLATIONS[name](None) if name in ARTICP_ABLATIONS else open_tracker(name)
 
 
 def means(results: Iterable[Result], jobs: int = 1) -> Iterator[Row]:
@@ -150,7 +156,7 @@ def _warm_up(trackers: list[str]) -> None:
 def _measure(case: Case) -> Result:
     seen = condition(case.condition)
     performer = performer_for(seen, case.body, None if case.clip == ROUTINE else case.clip, case.data)
-    run = follow(CONTESTANTS[case.tracker](None), sights(performer, seen, case.seconds), seen.start == "given")
+    run = follow(contestant(case.tracker), sights(performer, seen, case.seconds), seen.start == "given")
     metrics = run.metrics()
     if seen.start == "given":
         metrics.pop("time_to_skeleton_s", None)

@@ -13,7 +13,7 @@ from common.body.skeleton import NAMED_JOINT_LINKS
 from common.body.skeleton_pose import SkeletonPose, forward_kinematics, rest_pose
 from common.geometry import quaternion
 from common.geometry.point_cloud import PointCloud
-from scripts.bench_tracking import means
+from scripts.bench_tracking import CONTESTANTS, contestant, means
 from scripts.run_bench import Row, kept
 from scripts.tracking_conditions import (
     Sight,
@@ -206,3 +206,9 @@ def test_a_bench_cut_off_keeps_the_cases_it_has_done(tmp_path: Path) -> None:
     with pytest.raises(KeyboardInterrupt):
         kept(rows(), "some", tmp_path / "out.json")
     assert json.loads((tmp_path / "out.json").read_text()) == {"bench": "some", "rows": [row("a", 1.0), row("a", 2.0)]}
+
+
+def test_every_contestant_opens_and_has_seen_nothing() -> None:
+    assert {"gauss-newton", "articp", "articp-no-global"} <= set(CONTESTANTS)
+    for name in CONTESTANTS:
+        assert contestant(name).track(NOTHING, 0) is None
