@@ -62,7 +62,7 @@ class Part:
         """The link nearest to the root."""
         return int(self.body.links[0])
 
-    def at(self, pose: PoseState, R: Array, t: Array, scale: float) -> tuple[EllipsoidBody, Floats]:
+    def at(self, pose: PoseState, R: Array, t: Array, scale: float) -> tuple[EllipsoidBody, Array]:
         """The limb with all angles 0 in ``pose`` (link frames ``R, t``), semi-axes times ``scale``, and the (4, 4)
         transform that carries it. A particle then says how each joint turns from there, far from the half turn at
         which angles are singular."""
@@ -70,7 +70,8 @@ class Part:
         turned = np.swapaxes(R[at], 1, 2)
         centres = np.einsum("eij,ej->ei", R[links], self._ellipsoids.centres[self.rows]) + t[links] - t[at]
         first_of = {int(link): row for row, link in enumerate(self.body.links)}
-        offsets, T_world_parent = self.body.offsets, rigid_transform(np.eye(3), np.zeros(3))
+        offsets: Floats = self.body.offsets
+        T_world_parent: Array = np.eye(4)
         if self.first == 0:
             offsets = offsets.copy()
             offsets[0] = pose.root
@@ -181,7 +182,7 @@ class WholeBodyParticles:
             sigma[turning] += DOUBT_RAD * (1.0 - confidence[links].min()) ** 2
         return sigma
 
-    def _weigh(self, body: EllipsoidBody, T: Floats, points: Array, expected: Array, particles: Floats) -> Array:
+    def _weigh(self, body: EllipsoidBody, T: Array, points: Array, expected: Array, particles: Floats) -> Array:
         return self._weights(points, quadrics(body, particles, T), expected)
 
 
@@ -196,7 +197,7 @@ def _scale(cloud: PointCloud) -> float:
     return SKIN_SCALE if cloud.normals.any() else 1.0
 
 
-def _moved(pose: PoseState, body: EllipsoidBody, T_world_parent: Floats, particle: Floats) -> PoseState:
+def _moved(pose: PoseState, body: EllipsoidBody, T_world_parent: Array, particle: Floats) -> PoseState:
     """``pose`` with the joints of ``body`` turned as the ``particle`` (D,) says."""
     T = link_transforms(body, particle[None], T_world_parent)[0]
     root, local = pose.root, pose.local.copy()
