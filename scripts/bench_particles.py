@@ -25,9 +25,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from common.body.skeleton import LINK_INDEX, SIDES
-from scripts.bench_tracking import surface_points
 from scripts.limb_truth import LinkedBody, linked_body, posed_joints
 from scripts.run_bench import Row
+from scripts.tracking_conditions import surface_points
 from sender.capture.body_performer import PoseTrack
 from sender.capture.builtin_body import builtin_body
 from sender.capture.choreography import routine
