@@ -31,7 +31,7 @@ POINTS = 2000
 PAPER = AnnealingSettings()
 ONE_SIDED = np.zeros(6, np.float32)
 SIDE_COUNT = 5  # degrees of freedom of one leg
-_VIEW = (64, 48, 53.0)  # width, height and focal length [pixels] of the synthetic cameras
+_VIEW = (64, 48, 100.0)  # width, height and focal length [pixels] of the synthetic cameras
 CAMERA_M = 2.5  # from the pelvis
 
 
