@@ -149,10 +149,11 @@ class _Stream:
 
     def _skeleton_path(self, identity: StreamIdentity) -> SkeletonPath:
         source, settings = self._source, self._settings
-        reconstruction = DepthReconstruction if source.has_depth else HullReconstruction
+        given = source.cameras, source.empty_room, settings.tracking.points
+        inside = settings.tracking.tracker == "particles"
         return SkeletonPath(
             identity,
-            reconstruction(source.cameras, source.empty_room, settings.tracking.points),
+            DepthReconstruction(*given) if source.has_depth else HullReconstruction(*given, inside),
             self._tracker,
             source.frame_rate_hz,
             self._timer,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -63,8 +63,8 @@ class DepthReconstruction:
 class HullReconstruction:
     """Colour cameras: the visual hull of their silhouettes, and in it the one person that is followed.
 
-    ``empty_room``: (F, H, W, 3) per camera, or None where frames bring silhouettes. ``where``: points on the hull's
-    surface, with normals, or in its volume, without.
+    ``empty_room``: (F, H, W, 3) per camera, or None where frames bring silhouettes. ``inside``: once there is a pose,
+    points in the hull's volume, as particles want them; else, and until then, on its surface, with normals.
     """
 
     def __init__(
@@ -72,13 +72,13 @@ class HullReconstruction:
         cameras: Sequence[Camera],
         empty_room: Sequence[NDArray[Any] | None],
         points: int = 2500,
-        where: Literal["surface", "volume"] = "surface",
+        inside: bool = False,
         settings: SilhouetteSettings | None = None,
     ) -> None:
         rooms = zip(cameras, empty_room, strict=True)
         self._models = [SilhouetteModel(camera, room, settings) for camera, room in rooms]
         self._points = points
-        self._sampled = surface_points if where == "surface" else volume_points
+        self._inside = inside
         self._follower = PersonFollower()
         self._share = 1.0  # of the hull's points that were the person's
 
@@ -92,7 +92,8 @@ class HullReconstruction:
             return PersonPoints(PointCloud(empty, empty, empty.astype(np.uint8)), certainty=0.0)
         with timer.stage("hull"):
             hull = VisualHull(silhouettes)
-            cloud = self._sampled(hull, int(self._points / self._share))
+            sampled = volume_points if self._inside and last_joints is not None else surface_points
+            cloud = sampled(hull, int(self._points / self._share))
         with timer.stage("person"):
             found = self._follower.find(cloud, hull.cameras, last_joints)
             mine = np.flatnonzero(found.chosen)
