@@ -5,13 +5,14 @@ from __future__ import annotations
 import numpy as np
 
 from common.body.mannequin import mannequin, mannequin_camera, mannequin_depth
-from common.body.skeleton_pose import forward_kinematics
+from common.body.skeleton_pose import forward_kinematics, joint_positions
 from common.body.view import View
 from common.geometry.camera_model import Camera
 from common.runtime.clock import MonotonicClock
 from common.runtime.stage_timer import StageTimer
-from sender.capture.frame_set import DepthFrame, FrameSet
+from sender.capture.frame_set import ColourFrame, DepthFrame, FrameSet
 from sender.capture.outside_skeleton import OutsideSkeleton, Sensor
+from sender.capture.rig_layout import cameras_around
 from sender.config import CandidateSettings
 from sender.fitting.body_model import BodyModel
 from sender.fitting.gauss_newton_tracker import GaussNewtonSettings, GaussNewtonTracker
@@ -21,7 +22,7 @@ from sender.fitting.particle_tracker import ParticleSettings, ParticleTracker
 from sender.fitting.tracker import FitResult
 from sender.pipeline import CandidatePath, SkeletonPath, StreamIdentity, TrackedFrame
 from sender.reconstruction.foreground_points import PointSampler
-from sender.reconstruction.person_points import DepthReconstruction
+from sender.reconstruction.person_points import DepthReconstruction, HullReconstruction
 
 FRAME_NS = 33_333_333
 _IDENTITY = StreamIdentity(0, 0)
@@ -40,6 +41,16 @@ def rehearse_fitting() -> None:
     for index in range(1, 5):
         frame = DepthFrame(0, index, index * FRAME_NS, depth, colour)
         path.process(FrameSet(frame.capture_ns, (frame,)))
+
+
+def rehearse_hull() -> None:
+    """Carve a mannequin out of its silhouettes."""
+    cameras = cameras_around(3, 320, 240)
+    masks = [np.where(mannequin_depth(camera) > 0, 255, 0).astype(np.uint8) for camera in cameras]
+    frames = FrameSet(0, tuple(ColourFrame(index, 1, 0, None, mask) for index, mask in enumerate(masks)))
+    joints = joint_positions(*mannequin())
+    for inside in (False, True):
+        HullReconstruction(cameras, [None] * 3, inside=inside).person(frames, joints, StageTimer(MonotonicClock()))
 
 
 def rehearse_restart() -> None:
@@ -90,6 +101,7 @@ def rehearse_all() -> None:
     """What a sender does from the first frame on."""
     rehearse_fitting()
     rehearse_skeletons()
+    rehearse_hull()
     rehearse_candidates()
 
 

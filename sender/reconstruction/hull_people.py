@@ -13,8 +13,9 @@ import numpy as np
 import scipy.ndimage
 from numpy.typing import NDArray
 
-from common.geometry.camera_model import Camera, project
+from common.geometry.camera_model import Camera
 from common.geometry.point_cloud import PointCloud
+from common.geometry.rigid_transform import inverse, transform_points
 
 Floats = NDArray[np.floating]
 
@@ -96,13 +97,18 @@ def connected_volumes(positions: Floats) -> NDArray[np.int32]:
 
 
 def realness(positions: Floats, volumes: NDArray[np.int32], cameras: Sequence[Camera]) -> Floats:
-    """Of each volume (V,), 0..1: the largest share of its image, in any camera, that no other volume covers too."""
+    """Of each volume (V,), 0..1: the largest share of its image, in any of the pinhole ``cameras``, that no other
+    volume covers too."""
     count = int(volumes.max(initial=-1)) + 1
+    if count == 1:
+        return np.ones(1)
     best = np.zeros(count)
     kept = volumes >= 0
     for camera in cameras:
-        pixels, depths = project(camera, positions[kept])
-        there = (depths > 0) & (pixels >= 0).all(axis=1) & (pixels < (camera.width, camera.height)).all(axis=1)
+        local = transform_points(inverse(camera.T_world_camera), positions[kept])
+        depths = np.maximum(local[:, 2:], 1e-3)
+        pixels = local[:, :2] / depths * (camera.fx, camera.fy) + (camera.cx, camera.cy)
+        there = (local[:, 2] > 0) & (pixels >= 0).all(axis=1) & (pixels < (camera.width, camera.height)).all(axis=1)
         column, row = (pixels[there] * (BLOCKS_ACROSS / camera.width)).astype(np.int64).T
         covered = np.zeros((count, int(row.max(initial=0)) + 1, BLOCKS_ACROSS), np.bool_)
         covered[volumes[kept][there], row, column] = True
