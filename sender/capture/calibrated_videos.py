@@ -21,6 +21,7 @@ from sender.capture.frame_set import CaptureError
 from sender.capture.recording_folder import read_json
 
 _ROOM_FRAMES = 50  # of the empty room, spread over its video, that are kept
+_SKIPPED = 20  # frames at most are passed over one by one; farther on it is quicker to seek
 _MOST_FRAMES = 1_000_000
 # x stays, z becomes y, y becomes −z
 _Y_UP_FROM_Z_UP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
@@ -69,27 +70,31 @@ class _Video:
     """Frames of a video file, by number; in order they are cheap."""
 
     def __init__(self, file: Path, camera: Camera) -> None:
-        self._file, self._camera = file, camera
+        self._file = file
         self._lock = threading.Lock()  # several threads decode ahead
         self._video = cv2.VideoCapture(str(file)) if file.is_file() else None
         count = int(self._video.get(cv2.CAP_PROP_FRAME_COUNT)) if self._video is not None else 0
         if not 0 < count < _MOST_FRAMES:
             raise CaptureError(f"{file}: no video with frames")
+        assert self._video is not None
+        width, height = (int(self._video.get(p)) for p in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
+        if (width, height) != (camera.width, camera.height):
+            raise CaptureError(f"{file}: {width}×{height}, not {camera.width}×{camera.height}")
         self.numbers = range(count)
         self._next = 0
 
     def load(self, number: int) -> tuple[None, NDArray[np.uint8]]:
         with self._lock:
             assert self._video is not None
-            if number != self._next:
+            if not self._next <= number <= self._next + _SKIPPED:
                 self._video.set(cv2.CAP_PROP_POS_FRAMES, number)
+                self._next = number
+            for _ in range(number - self._next):
+                self._video.grab()
             there, picture = self._video.read()
             self._next = number + 1
         if not there:
             raise CaptureError(f"{self._file}: no frame {number}")
-        size = picture.shape[1], picture.shape[0]
-        if size != (self._camera.width, self._camera.height):
-            raise CaptureError(f"{self._file}: {size[0]}×{size[1]}, not {self._camera.width}×{self._camera.height}")
         return None, np.ascontiguousarray(picture[..., ::-1], np.uint8)
 
 
