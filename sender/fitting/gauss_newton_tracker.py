@@ -19,7 +19,8 @@ from common.geometry.point_cloud import PointCloud
 from sender.fitting.articulated_gauss_newton import FitArrays, PoseState, Schedule, forward
 from sender.fitting.body_fitter import BodyFitter
 from sender.fitting.body_model import BodyModel
-from sender.fitting.initial_pose import NoPose, find_initial_pose
+from sender.fitting.initial_pose import NoPose
+from sender.fitting.initial_pose_search import InitialPoseSearch
 from sender.fitting.joint_limits import joint_table, turned_on
 from sender.fitting.limb_search import Limb, limbs, search_limb, thinned, within_reach
 from sender.fitting.tracker import FitResult
@@ -35,14 +36,15 @@ MINIMUM_POINTS = 40
 class GaussNewtonSettings:
     """``building_s``: how long the surface is gathered after the start pose. ``good_score``, ``lost_score``: mean
     robust cost per point (0..1) below which a pose is trusted, and above which the person counts as lost; ``lost_s``:
-    for this long before looking again. ``stranger_s``: how long the known person is looked for before anybody else in
-    a start pose will do."""
+    for this long before looking again. ``stranger_s``: how long the known person is looked for before anybody else
+    will do. ``floor_y`` [m]: height of the floor, when known."""
 
     building_s: float = 1.5
     good_score: float = 0.095
     lost_score: float = 0.25
     lost_s: float = 1.0
     stranger_s: float = 2.0
+    floor_y: float | None = None
 
 
 HYPOTHESES = (1.0, 0.5, 0.0)  # shares of the last velocity
@@ -67,6 +69,7 @@ class GaussNewtonTracker:
         self._limbs = limbs(self._table)
         self._body = body
         self._search: WholeBodySearch | None = None if body is None else WholeBodySearch(body, self._table)
+        self._newcomer = InitialPoseSearch(settings.floor_y)
         self._state: PoseState | None = None
         self._before: PoseState | None = None  # the frame before: velocity
         self._times_ns = (0, 0)  # of the state and of the frame before
@@ -116,18 +119,18 @@ class GaussNewtonTracker:
         return self._accept(fit, cloud, capture_ns)
 
     def _look(self, cloud: PointCloud, capture_ns: int) -> FitResult | None:
-        """The known person in any pose; when there is none, or they do not come, anybody in a start pose."""
+        """The known person in any pose; when there is none, or they do not come, anybody upright."""
         if self._looking_since_ns is None:
             self._looking_since_ns = capture_ns
         if self._search is not None:
             fit = self._search.step(cloud)
-            if fit.score < self._settings.good_score:
+            if self._search.recognises(fit, cloud):
                 self._begin(fit.pose, capture_ns)
                 return self._accept(fit, cloud, capture_ns)
             self._status = f"looking for the known person: best score {fit.score:.2f}"
             if capture_ns - self._looking_since_ns < self._settings.stranger_s * 1e9:
                 return self._unseen()
-        found = find_initial_pose(cloud)
+        found = self._newcomer.step(cloud, capture_ns)
         if isinstance(found, NoPose):
             self._status = f"looking for a person: {found.reason}"
             return self._unseen()
@@ -136,6 +139,7 @@ class GaussNewtonTracker:
     def _begin(self, state: PoseState, capture_ns: int) -> None:
         body = self._known_body()
         self._search = WholeBodySearch(body, self._table)
+        self._newcomer = InitialPoseSearch(self._settings.floor_y)
         self._state = self._before = state
         self._times_ns = (capture_ns, capture_ns)
         self._usual = np.zeros(LINK_COUNT)
