@@ -43,6 +43,7 @@ ONE_SIDED = Demands(0.93, 0.15, 140.0, 100.0), Demands(0.88, 0.30, 220.0, 70.0)
 UPRIGHT_RAD = 1.0
 MEMORY_S = 1.0  # evidence fades: early frames may have had no fit near the truth
 INDEPENDENT_S = 0.1  # frames closer in time say the same thing
+MISGIVING = 25.0  # nor may the other side be this much cheaper on the last frame, whatever was seen before
 WALKED_COST_PER_M = 100.0
 STEADY_S, STEADY_M, STEADY_SHARE = 0.4, 0.06, 0.15  # an upper body neither grows nor rises: nobody is coming in
 
@@ -66,14 +67,14 @@ class InitialPoseSearch:
     def step(self, cloud: PointCloud, capture_ns: int) -> InitialPose | NoPose:
         """The start pose in ``cloud`` (N points, world, y up) of ``capture_ns``, or why there is none yet."""
         points, normals = cloud.positions.astype(np.float64), cloud.normals.astype(np.float64)
-        outline = outline_of(points, normals, self._floor_y if self._lowest_y is None else self._lowest_y)
+        outline = outline_of(points, normals, self._floor_below(points))
         if isinstance(outline, NoPose):
             self._forget()
             return outline
         if not outline.whole_body:
             return self._upper_body(points, normals, outline, capture_ns)
         self._steady = None
-        if self._floor_y is None:  # who stood there before has not lost their legs by crouching
+        if self._floor_y is None:
             self._lowest_y = outline.floor_y if self._lowest_y is None else min(self._lowest_y, outline.floor_y)
         starts = first_starts(self._template, outline)
         if self._frame > 0:
@@ -81,6 +82,12 @@ class InitialPoseSearch:
         carried = [_carried(fit) for side in self._sides for fit in side[:KEPT]]
         self._weigh(fitted(self._template, points, normals, outline, starts, carried), capture_ns)
         return self._decided(outline)
+
+    def _floor_below(self, points: Floats) -> float | None:
+        """The known floor, or the lowest that was stood on: who crouches or jumps has not lost their legs."""
+        if self._floor_y is not None or self._lowest_y is None or len(points) == 0:
+            return self._floor_y
+        return min(self._lowest_y, float(points[:, 1].min()))
 
     def _weigh(self, fits: list[TemplateFit], capture_ns: int) -> None:
         """Divides the fits of this frame into the two sides and adds what they say."""
@@ -106,7 +113,11 @@ class InitialPoseSearch:
         waited = min((self._times_ns[1] - self._times_ns[0]) * 1e-9 / PATIENCE_S, 1.0)
         first, last = ONE_SIDED if outline.one_sided else ALL_AROUND
         demands = Demands(*(a + (b - a) * waited for a, b in zip(first, last, strict=True)))
-        if not better or (other and other[0].cost < better[0].cost) or abs(self._evidence) < demands.evidence:
+        if (
+            not better
+            or (other and other[0].cost < better[0].cost - MISGIVING)
+            or abs(self._evidence) < demands.evidence
+        ):
             return NoPose("front and back are not told apart yet")
         best = better[0]
         if max(abs(best.theta[ROOT + 3]), abs(best.theta[ROOT + 5])) > UPRIGHT_RAD:
