@@ -31,7 +31,7 @@ Floats = NDArray[np.float64]
 ANGLES = {"0": "0", "45": "1", "90": "2"}  # degrees → layout in the file names
 FRAME_S = 1 / 30
 GAP_S = 0.1  # neighbours in time are no farther apart
-SHIFTS_S = np.arange(-0.08, 0.0801, 0.004)
+SHIFTS_S = np.arange(-0.08, 0.0801, 0.008)
 FAST_M = 0.1  # a frame's step beyond this is a jump, not motion
 
 

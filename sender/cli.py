@@ -29,7 +29,7 @@ def parse_arguments(arguments: list[str] | None = None) -> argparse.Namespace:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     capture = parser.add_argument_group("capture")
-    capture.add_argument("--recording", dest="capture.recording", type=Path, metavar="DIR", help="play a recording")
+    capture.add_argument("--recording", dest="capture.recording", type=Path, metavar="PATH", help="play a recording")
     capture.add_argument("--rig", dest="capture.rig_socket", type=Path, metavar="SOCKET", help="attach to this rig")
     capture.add_argument("--body", dest="capture.body", metavar="NAME", help="builtin (default), or a body of --data")
     capture.add_argument("--motion", dest="capture.motion", metavar="ID", help="a motion clip of --data")

@@ -26,15 +26,13 @@ _FINGERS = (("hand", "hand_tip"), ("wrist", "thumb"))
 
 
 def bones_of(kind: str) -> NDArray[np.int64]:
-    """The bones (B, 2) between the joints of ``kind``, parent first, from the hips outwards; beside them the lines
-    between the shoulders and between the hips, whose lengths are as constant."""
+    """The bones (B, 2) between the joints of ``kind``: a tree, parent first, from the hips outwards."""
     hips, shoulders = _ENDS[kind]
     bones = list(_TRUNK[kind])
     for side in ("left", "right"):
         bones += [(shoulders, f"{side}_shoulder"), (hips, f"{side}_hip")]
         limbs = _LIMBS + (_FINGERS if kind == "kinect-v2" else ())
         bones += [(f"{side}_{a}", f"{side}_{b}") for a, b in limbs]
-    bones += [("left_shoulder", "right_shoulder"), ("left_hip", "right_hip")]
     names = JOINTS_BY_KIND[kind]
     return np.array([(names.index(a), names.index(b)) for a, b in bones], np.int64)
 
@@ -48,9 +46,14 @@ class RunningMedian:
         self.count = 0
         self.value: Floats = np.full(size, np.nan)
 
+    @property
+    def settled(self) -> bool:
+        """Whether the estimate is final."""
+        return self.count >= SAMPLES
+
     def update(self, sample: Floats) -> Floats:
         """The estimate (N,) after this frame; NaN of what no frame has shown."""
-        if self.count < SAMPLES:
+        if not self.settled:
             self._samples[self.count] = sample
             self.count += 1
             if self.count & (self.count - 1) == 0:  # a power of two

@@ -138,8 +138,7 @@ class _Fitting:
         link = LINK_INDEX[name]
         wanted = target - self.origins[link]
         if np.linalg.norm(wanted) > 1e-6:  # False for NaN
-            turn = quaternion.shortest_arc(self.world[link] @ local, wanted)
-            self.world[link] = quaternion.to_matrix(turn) @ self.world[link]
+            self.world[link] = _shortest_turn(self.world[link] @ local, wanted) @ self.world[link]
 
     def _twist(self, name: str, bone: Floats, towards: Floats, local: Floats) -> None:
         """Turn the link about its ``bone`` so that ``towards`` lies on the side of the direction ``local`` (3,) of its
@@ -153,5 +152,19 @@ class _Fitting:
         blended = aside + STRAIGHT * carried * min(1.0, STRAIGHT / max(float(np.linalg.norm(aside)), 1e-6))
         blended -= axis * (axis @ blended)
         if np.linalg.norm(blended) > 1e-6:
-            turn = np.arctan2(axis @ np.cross(carried, blended), carried @ blended)
-            self.world[link] = quaternion.to_matrix(quaternion.from_rotation_vector(turn * axis)) @ self.world[link]
+            self.world[link] = _shortest_turn(carried, blended) @ self.world[link]
+
+
+def _shortest_turn(a: Floats, b: Floats) -> Floats:
+    """The smallest rotation (3, 3) of direction ``a`` (3,) onto ``b``; as ``quaternion.shortest_arc``, for one pair."""
+    scale = float(np.sqrt((a @ a) * (b @ b)))
+    cosine = float(a @ b) / scale
+    if cosine < -0.999999:
+        return np.asarray(quaternion.to_matrix(quaternion.shortest_arc(a, b)))
+    x, y, z = (
+        (a[1] * b[2] - a[2] * b[1]) / scale,
+        (a[2] * b[0] - a[0] * b[2]) / scale,
+        (a[0] * b[1] - a[1] * b[0]) / scale,
+    )
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    return np.asarray(np.eye(3) + cross + cross @ cross / (1 + cosine))

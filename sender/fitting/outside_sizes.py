@@ -28,6 +28,8 @@ class TrunkJoints:
         self.top = names.index("shoulder_centre" if kind == "kinect-v1" else "spine_shoulder")
         self.middle_link = "lower_spine" if kind == "kinect-v1" else "upper_spine"
         self.hips = [names.index(f"{side}_hip") for side in SIDES]
+        rest = human_skeleton(AVERAGE_STATURE_M).offsets[LINK_INDEX["neck"]].astype(np.float64)
+        self._rest_chest = axes(np.array([1.0, 0.0, 0.0]), rest)
         self.shoulders = [names.index(f"{side}_shoulder") for side in SIDES]
 
     def pelvis_frame(self, joints: Floats) -> Floats:
@@ -36,10 +38,9 @@ class TrunkJoints:
 
     def chest_frame(self, joints: Floats) -> Floats:
         """Rotation (3, 3) of the chest: x through the shoulders, y up the spine, which leans back in our rest pose."""
-        rest = human_skeleton(1.0).offsets[LINK_INDEX["neck"]].astype(np.float64)
         across = joints[self.shoulders[0]] - joints[self.shoulders[1]]
         seen = axes(across, joints[self.top] - joints[self.middle])
-        return np.asarray(seen @ axes(np.array([1.0, 0.0, 0.0]), rest).T)
+        return np.asarray(seen @ self._rest_chest.T)
 
 
 def axes(x: Floats, near_y: Floats) -> Floats:
@@ -69,6 +70,8 @@ class OutsideSizes:
 
     def update(self, joints: Floats) -> Skeleton:
         """The sizes after a frame's ``joints`` (J, 3) [m, world]; NaN for a joint that was not seen."""
+        if self._medians.settled:
+            return self.skeleton
         before = self._medians.value
         after = self._medians.update(self._measured(joints))
         if after is not before:

@@ -27,16 +27,18 @@ NOISE_M = 0.002  # of a tracked joint, before anything is known of a sensor
 LEAST_NOISE_M = 0.001
 NOISE_RATE = 0.05  # of the running mean of the noise, per frame
 ACCELERATION_M_S2 = 7.0  # usual for limbs: what a place in the past is worth
-PULL_S = 1.0  # over which the joints come to the mean of the places
+PULL_S = 0.5  # over which the joints come to the mean of the places
+DRIFT_M2_S = 1e-3  # variance per second of where a sensor places a joint
 DISAGREEMENT_M = 0.03
 BONE_ERROR_M = 0.03
 SIDE_ON = 0.25  # weight of a sensor that sees the person from the side or from behind
-TRIAL_FRAMES = 64
-ANOTHER_PERSON = 0.08  # median difference of the bones' lengths
+EARLY_FRAMES = 64
+TRIAL_FRAMES = 256  # a person who comes in from the side is measured badly at first
+ANOTHER_PERSON = 0.12  # median difference of the bones' lengths
 VELOCITY_RATE = 0.6
 PAUSE_S = 0.3  # after so long the past does not say where the joints are
 ABSENCE_S = 2.0  # after so long it may be another person
-PROJECTIONS = 30
+PROJECTIONS = 100
 PAST_M = 0.02  # what a place that the past leads to is worth at once
 UNSEEN_M = 0.1  # how well a joint is known that nobody sees
 SEEN = 0.5  # least confidence of a joint that sizes are learned from
@@ -155,13 +157,20 @@ class SkeletonMerger:
         self._welcome(words, led)
         said = words.places - np.array([witness.bias for witness in words.witnesses])
         variance = self._variance(words, said, led)
-        joints = _mean(said, variance, led, passed_s)
-        self._keep_bones(joints, variance, words.confidence)
-        self._hold_on(words, joints, passed_s)
-        self._move_on(joints, words.confidence, capture_ns, passed_s)
+        free = _mean(said, variance, led, passed_s)
+        self._hold_on(words, free, passed_s)
+        joints = self._with_bones_kept(free, variance, words)
+        unseen = words.confidence.max(axis=0) == 0
+        remembered = joints if self._knows_lengths else np.where(unseen[:, None], joints, free)
+        self._move_on(remembered, unseen, capture_ns, passed_s)
         apart = np.linalg.norm(said - joints, axis=2)[words.confidence > SEEN]
         spread_m = float(np.sqrt((apart**2).mean())) if len(apart) else 0.0
         return MergedSkeleton(capture_ns, joints, words.confidence.max(axis=0), spread_m)
+
+    @property
+    def _knows_lengths(self) -> bool:
+        """Early on lengths may be wrong, and must not confirm themselves."""
+        return self._learned.count >= EARLY_FRAMES
 
     def _passed_s(self, capture_ns: int) -> float:
         """Since the last instant; after a pause the past is forgotten, after an absence the person as well."""
@@ -172,7 +181,7 @@ class SkeletonMerger:
         self._velocity = np.zeros_like(self._velocity)
         for witness in self._witnesses:
             witness.bias[:], witness.tracked[:] = 0.0, False
-        if not 0 <= passed_s < ABSENCE_S:
+        if not 0 <= passed_s < ABSENCE_S and self._learned.count:
             self._stranger = RunningMedian(len(self.bones))
         return 0.0
 
@@ -229,20 +238,32 @@ class SkeletonMerger:
             np.minimum.at(least, ends, np.nan_to_num(error, nan=np.inf).T)
         return np.asarray(1 / (1 + (np.where(np.isfinite(least), least, 0.0).T / BONE_ERROR_M) ** 2))
 
-    def _keep_bones(self, joints: Floats, variance: Floats, confidence: Floats) -> None:
-        """Learn the bones' lengths from the joints (J, 3), and give the joints' bones these lengths."""
-        first, second = self.bones.T
-        lengths = np.linalg.norm(joints[first] - joints[second], axis=1)
-        seen = confidence.max(axis=0) > SEEN
-        lengths[~(seen[first] & seen[second])] = np.nan
-        self._learn(lengths)
+    def _with_bones_kept(self, free: Floats, variance: Floats, words: _Words) -> Floats:
+        """The joints (J, 3) with their bones at the lengths learned, from this frame as well."""
+        self._learn(words)
         share = 1 / ((1 / variance).sum(axis=0) + 1 / UNSEEN_M**2)
+        joints = free.copy()
         _keep_lengths(joints, share, self.bones, self.lengths, PROJECTIONS)
+        return joints
 
-    def _learn(self, lengths: Floats) -> None:
-        """Learn from the ``lengths`` (B,) of one frame. After an absence they are learned anew aside, and taken when
-        they are clearly another person's."""
-        if self._stranger is None or not np.isfinite(self.lengths).any():
+    def _measured(self, words: _Words) -> Floats:
+        """The bones' lengths (B,) [m] by the sensors that see both ends: the mean, weighted by their noise, which makes
+        a bone longer and is taken off; NaN of a bone that nobody sees."""
+        first, second = self.bones.T
+        square = ((words.places[:, first] - words.places[:, second]) ** 2).sum(axis=2)
+        noise = np.array([witness.noise for witness in words.witnesses])
+        variance = noise[:, first] + noise[:, second]
+        lengths = np.sqrt(np.maximum(square - 2 * variance, square / 4))
+        seen = words.confidence > SEEN
+        weight = np.where(seen[:, first] & seen[:, second], 1 / variance, 0.0)
+        total = weight.sum(axis=0)
+        return np.where(total > 0, (weight * lengths).sum(axis=0) / np.maximum(total, _TINY), np.nan)
+
+    def _learn(self, words: _Words) -> None:
+        """Learn the bones' lengths from one frame. After an absence they are learned anew aside, and taken when they
+        are clearly another person's."""
+        lengths = self._measured(words)
+        if self._stranger is None:
             self.lengths = self._learned.update(lengths)
             return
         theirs = self._stranger.update(lengths)
@@ -254,23 +275,30 @@ class SkeletonMerger:
 
     def _hold_on(self, words: _Words, joints: Floats, passed_s: float) -> None:
         """From here on each sensor's motion counts, from where the joints are now, and slowly its place as well."""
-        trust = words.confidence * self._facing(words, joints)[:, None]
+        noise = np.array([witness.noise for witness in words.witnesses])
+        trust = words.confidence * self._facing(words, joints)[:, None] / noise
         total = trust.sum(axis=0)[:, None]
         mean = (trust[..., None] * words.places).sum(axis=0) / np.maximum(total, _TINY)
         pull = np.where(total > 0, min(passed_s / PULL_S, 1.0) * (mean - joints), 0.0)
         for witness, own, stale in zip(words.witnesses, words.places, words.staleness, strict=True):
-            fresh = witness.noise / (witness.noise + stale)
-            witness.bias += fresh[:, None] * (own - joints - witness.bias) - pull
+            gain = _drift_gain(DRIFT_M2_S * passed_s, witness.noise + stale)
+            witness.bias += gain[:, None] * (own - joints - witness.bias) - pull
 
-    def _move_on(self, joints: Floats, confidence: Floats, capture_ns: int, passed_s: float) -> None:
+    def _move_on(self, joints: Floats, unseen: NDArray[np.bool_], capture_ns: int, passed_s: float) -> None:
         if passed_s > 0:
             velocity = np.nan_to_num((joints - self._joints) / passed_s)
             self._velocity += VELOCITY_RATE * (velocity - self._velocity)
-        unseen = confidence.max(axis=0) == 0
-        for parent, joint in self.bones[: len(joints) - 1]:  # outwards: what nobody sees goes with its parent
+        for parent, joint in self.bones:  # outwards: what nobody sees goes with its parent
             if unseen[joint]:
                 self._velocity[joint] = self._velocity[parent]
         self._joints, self._capture_ns = joints, capture_ns
+
+
+def _drift_gain(drift: float, noise: Floats) -> Floats:
+    """Share (J,) of a difference that is taken for the sensor's own: the steady gain of a Kalman filter for a place
+    that drifts with variance ``drift`` a frame, seen with variance ``noise`` (J,)."""
+    known = (drift + np.sqrt(drift**2 + 4 * drift * noise)) / 2
+    return np.asarray(known / (known + noise))
 
 
 def _mean(said: Floats, variance: Floats, led: Floats, passed_s: float) -> Floats:
