@@ -35,7 +35,8 @@ POINTS = 2500
 LOST_M = 0.20
 MOVES_M = 0.20
 SHEET = 20  # overlays on the contact sheet
-SHEET_COLUMNS = 5
+SHEET_COLUMNS = 10
+TILE_WIDTH = 240
 _LIMB = ("upper_arm", "forearm", "hand", "fingers")
 _LEG = ("thigh", "shin", "foot", "toes")
 # The link that carries each of the SDK's 20 joints, in the order of Skeleton_joint_order.txt.
@@ -82,9 +83,9 @@ def run(
     for file in _files(data / "rgbd" / "utd_mhad", clips):
         tracks.append(_tracked(UtdMhadSequence(file), seconds))
         print(f"{tracks[-1].name}: {np.median(tracks[-1].cpu_ms):.1f} ms a frame", file=sys.stderr, flush=True)
-    errors = [track.distances(_offsets(tracks, track)) for track in tracks]
+    errors = [track.distances(offsets_for(tracks, track)) for track in tracks]
     if pictures is not None:
-        _contact_sheet(data / "rgbd" / "utd_mhad", tracks, errors, pictures / "utd_mhad.jpg")
+        _contact_sheet(data / "rgbd" / "utd_mhad", tracks, errors, pictures / "utd_mhad.png")
     rows = []
     for track, error in zip(tracks, errors, strict=True):
         rows += _rows(f"utd-mhad/{track.name}", [track], [error])
@@ -125,7 +126,7 @@ def _tracked(sequence: UtdMhadSequence, seconds: float | None) -> Track:
     return track
 
 
-def _offsets(tracks: list[Track], judged: Track) -> Floats:
+def offsets_for(tracks: list[Track], judged: Track) -> Floats:
     """Where the SDK's joints lie in the frames of our links (20, 3) [m]: the median over the subject's other sequences.
     A subject with one sequence only is judged by its own."""
     others = [track for track in tracks if track.subject == judged.subject and track is not judged]
@@ -138,7 +139,7 @@ def _rows(case: str, tracks: list[Track], errors: list[Floats]) -> list[Row]:
     distances = np.concatenate(errors)
     there = np.isfinite(distances[:, 0])
     of_frame = np.where(there, np.median(distances, axis=1), np.inf)
-    ours, frozen = (np.concatenate(part) for part in zip(*map(_moving, tracks, errors), strict=True))
+    ours, frozen = (np.concatenate(part) for part in zip(*map(moving, tracks, errors), strict=True))
     cpu_ms = np.concatenate([track.cpu_ms for track in tracks])
     figures: list[tuple[str, float | None, str]] = [
         ("joint_distance_median", float(np.median(distances[there])) if there.any() else None, "m"),
@@ -152,7 +153,7 @@ def _rows(case: str, tracks: list[Track], errors: list[Floats]) -> list[Row]:
     return [Row(case=case, metric=m, value=v, unit=u, reference=None, source="") for m, v, u in figures]
 
 
-def _moving(track: Track, distances: Floats) -> tuple[Floats, Floats]:
+def moving(track: Track, distances: Floats) -> tuple[Floats, Floats]:
     """Of the joints that move, in frames with a skeleton: our error [m], and that of the first skeleton kept still."""
     frozen = np.linalg.norm(track.joints - track.joints[0], axis=2)
     moves = frozen.max(axis=0) > MOVES_M
@@ -162,7 +163,7 @@ def _moving(track: Track, distances: Floats) -> tuple[Floats, Floats]:
 
 def _contact_sheet(folder: Path, tracks: list[Track], errors: list[Floats], file: Path) -> None:
     """Frames spread over the sequences and their time, our bones over the depth, the SDK's joints as white dots."""
-    tiles: list[np.ndarray] = []
+    tiles: list[NDArray[np.uint8]] = []
     for place in np.linspace(0, len(tracks) - 1, min(SHEET, len(tracks))).astype(int):
         track, error = tracks[place], errors[place]
         number = int((0.3 + 0.4 * (len(tiles) % 2)) * len(track.fits))  # arms are up around the middle
@@ -180,6 +181,9 @@ def tile(folder: Path, track: Track, distances: Floats, number: int) -> NDArray[
     if fit is not None:
         draw(picture, sequence.cameras[0], fit.skeleton, fit.pose, scale)
     dots(picture, sequence.cameras[0], track.joints[number], scale)
+    u = np.nonzero(picture.any(axis=(0, 2)))[0]  # the person fills a third of the width
+    left = int(np.clip((u.min() + u.max() - TILE_WIDTH) // 2, 0, picture.shape[1] - TILE_WIDTH))
+    picture = np.ascontiguousarray(picture[:, left : left + TILE_WIDTH])
     label = f"{track.name} {number}: {np.median(distances[number]) * 100:.0f} cm"
-    cv2.putText(picture, label, (6, 18), cv2.FONT_HERSHEY_SIMPLEX, 0.5, (255, 255, 255), 1, cv2.LINE_AA)
+    cv2.putText(picture, label, (6, 18), cv2.FONT_HERSHEY_SIMPLEX, 0.45, (255, 255, 255), 1, cv2.LINE_AA)
     return picture
