@@ -36,7 +36,7 @@ from sender.fitting.open_tracker import open_tracker
 from sender.fitting.outside_joints import sensor_joints
 from sender.fitting.outside_tracker import OutsideTracker
 from sender.pipeline import SkeletonPath, StreamIdentity, TrackedFrame
-from sender.reconstruction.foreground_points import PointSampler
+from sender.reconstruction.person_points import HullReconstruction
 from tests.capsule_person import SKELETON, pose_at
 from tests.outside_people import FRAME_NS, SENSORS, person_at, recording, row_of, seen
 
@@ -48,7 +48,9 @@ def path_of(recorded: SkeletonRecording) -> SkeletonPath:
     clock = ManualClock()
     outside = OutsideTracker(recorded.kind, recorded.sensors)
     tracker, timer = open_tracker("gauss-newton"), StageTimer(clock)
-    return SkeletonPath(StreamIdentity(0, 5), [], PointSampler(()), tracker, 30.0, timer, clock, None, outside)
+    return SkeletonPath(
+        StreamIdentity(0, 5), HullReconstruction((), (), 2500, False), tracker, 30.0, timer, clock, None, outside
+    )
 
 
 def sent(recorded: SkeletonRecording) -> list[TrackedFrame]:
