@@ -90,6 +90,7 @@ def test_descendants_follow() -> None:
     for link in ("left_thigh", "left_shin", "left_foot", "left_toes"):
         np.testing.assert_allclose(found.joints[LINK_INDEX[link]], swung.joints[LINK_INDEX[link]], atol=0.02)
         np.testing.assert_allclose(found.rotations[LINK_INDEX[link]], swung.rotations[LINK_INDEX[link]], atol=0.05)
+    np.testing.assert_allclose(bones_m(found), bones_m(state), atol=1e-9)
     others = ~DESCENDANTS[THIGH]
     np.testing.assert_array_equal(found.joints[others], state.joints[others])
 
