@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from common.body.mannequin import mannequin, mannequin_camera, mannequin_depth
-from common.body.skeleton_pose import forward_kinematics, joint_positions
+from common.body.skeleton_pose import forward_kinematics, joint_positions, named_joint_positions
 from common.body.view import View
 from common.geometry.camera_model import Camera
 from common.runtime.clock import MonotonicClock
@@ -16,6 +16,7 @@ from sender.capture.rig_layout import cameras_around
 from sender.config import CandidateSettings
 from sender.fitting.body_model import BodyModel
 from sender.fitting.gauss_newton_tracker import GaussNewtonSettings, GaussNewtonTracker
+from sender.fitting.initial_pose_search import InitialPoseSearch
 from sender.fitting.outside_joints import sensor_joints
 from sender.fitting.outside_tracker import OutsideTracker
 from sender.fitting.particle_tracker import ParticleSettings, ParticleTracker
@@ -29,7 +30,7 @@ _IDENTITY = StreamIdentity(0, 0)
 
 
 def rehearse_fitting() -> None:
-    """Find a mannequin and follow it for a few frames."""
+    """Look for a mannequin, which has neither front nor back, and follow it from its own joints for a few frames."""
     camera = mannequin_camera()
     depth = mannequin_depth(camera)
     colour = np.full((*depth.shape, 3), 128, np.uint8)
@@ -37,7 +38,9 @@ def rehearse_fitting() -> None:
     clock = MonotonicClock()
     tracker = GaussNewtonTracker(GaussNewtonSettings(building_s=2 * FRAME_NS / 1e9))
     reconstruction = DepthReconstruction([camera], [room])
-    path = SkeletonPath(_IDENTITY, reconstruction, tracker, 30.0, StageTimer(clock), clock)
+    InitialPoseSearch().step(PointSampler([camera]).points([_view(camera)]), 0)
+    joints = named_joint_positions(*mannequin())
+    path = SkeletonPath(_IDENTITY, reconstruction, tracker, 30.0, StageTimer(clock), clock, joints)
     for index in range(1, 5):
         frame = DepthFrame(0, index, index * FRAME_NS, depth, colour)
         path.process(FrameSet(frame.capture_ns, (frame,)))
