@@ -75,10 +75,11 @@ def test_nearest_bone_is_measured_in_radii() -> None:
     starts, ends = bone_segments(SKELETON, T_REST)
     middles = (0.5 * (starts + ends)).astype(np.float32)
     links = [LINK_INDEX[name] for name in ("left_forearm", "right_shin", "head", "left_upper_arm")]
-    first, second, ratio = nearest_bones(middles[links], starts, ends, SKELETON.radii)
+    first, second, near, ratio = nearest_bones(middles[links], starts, ends, SKELETON.radii)
     assert first.tolist() == links
     assert (second != first).all()
     assert (ratio > 1).all()
+    assert near.max() < 1e-3
 
 
 def test_points_are_kept_in_the_frame_of_their_link() -> None:
@@ -102,14 +103,52 @@ def test_links_learn_in_turns() -> None:
     np.testing.assert_array_equal(in_turns.surface().points, at_once.surface().points)
 
 
-def test_points_seen_once_among_many_frames_are_noise() -> None:
-    def thickness_m(body: BodyModel) -> float:
-        points = body.surface().points
-        return float(np.abs(np.linalg.norm(points[:, 1:], axis=1) - 0.035)[np.abs(points[:, 0] - 0.11) < 0.05].max())
+def thickness_m(body: BodyModel) -> float:
+    """How far points lie from the forearm's tube at most, away from its ends."""
+    points = body.surface().points
+    return float(np.abs(np.linalg.norm(points[:, 1:], axis=1) - 0.035)[np.abs(points[:, 0] - 0.11) < 0.05].max())
 
+
+def test_points_seen_once_among_many_frames_are_noise() -> None:
     flying = forearm_cloud(1, 0.03, 12)
     assert thickness_m(body_of(flying)) > 0.025
     assert thickness_m(body_of(flying, *(forearm_cloud(seed, 0.001, 2000) for seed in range(0, 20, 2)))) < 0.01
+
+
+def half_of(cloud: PointCloud, upper: bool) -> PointCloud:
+    kept = (cloud.normals[:, 1] > 0) == upper
+    return PointCloud(cloud.positions[kept], cloud.normals[kept], cloud.colours[kept])
+
+
+def test_a_side_that_turns_up_late_becomes_surface_once_it_was_seen_again() -> None:
+    body = body_of(*(half_of(forearm_cloud(seed), True) for seed in range(8)))
+    certain = np.ones(LINK_COUNT, bool)
+    late = half_of(forearm_cloud(20, count=900), False)
+    body.surface()
+    body.add_unseen(late, T_REST, certain)
+    assert body.surface().normals[:, 1].min() > -0.5  # seen once: may be noise
+    body.add_unseen(late, T_REST, certain)
+    assert body.surface().normals[:, 1].min() < -0.9
+
+
+def test_nothing_is_learned_for_uncertain_links_or_from_far_away() -> None:
+    body = body_of(forearm_cloud())
+    count = body.point_count
+    late = forearm_cloud(20)
+    body.add_unseen(late, T_REST, np.zeros(LINK_COUNT, bool))
+    far = PointCloud(late.positions + np.float32([0, 0.3, 0.0]), late.normals, late.colours)
+    body.add_unseen(far, T_REST, np.ones(LINK_COUNT, bool))
+    assert body.point_count == count
+
+
+def test_thick_shells_are_thinned_towards_their_middle(monkeypatch: pytest.MonkeyPatch) -> None:
+    def scatter_m() -> float:
+        thick = body_of(*(forearm_cloud(seed, 0.015, 2000) for seed in range(0, 16, 2)))
+        return float(np.abs(np.linalg.norm(thick.surface().points[:, 1:], axis=1) - 0.035).mean())
+
+    thinned_m = scatter_m()
+    monkeypatch.setattr(body_model, "THICK_M", np.inf)
+    assert thinned_m < 0.8 * scatter_m()
 
 
 def test_memory_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:

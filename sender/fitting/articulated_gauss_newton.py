@@ -80,7 +80,7 @@ def forward(root: Array, local: Array, offsets: Array, parents: Array) -> tuple[
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
-def _normal_equations(
+def normal_equations(
     points: Array,
     links: Array,
     rows: Array,
@@ -152,29 +152,35 @@ def _normal_equations(
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
-def _project(H: Array, g: Array, R: Array, t: Array, table: JointTable, scale: float, A: Array, b: Array) -> None:
-    """A (6+D, 6+D) and b (6+D,): link sums, child into parent, on the root's twist and the joint axes."""
-    links = len(H)
-    for link in range(links - 1, 0, -1):
-        up = table.parents[link]
-        for i in range(6):
-            g[up, i] += g[link, i]
-            for j in range(6):
-                H[up, i, j] += H[link, i, j]
-    dofs = len(table.dof_link)
-    A[:] = 0.0
-    S = np.zeros((6 + dofs, 6))  # unit twists about the root joint
+def axis_twists(R: Array, t: Array, table: JointTable, S: Array, links: Array) -> None:
+    """Unit twists (ω, v) about the root joint of the root's six and the D joint axes: fills the first 6+D rows of
+    ``S`` (K, 6) and of ``links`` (K,) int64, the link each of them moves, with all below it."""
+    S[: 6 + len(table.dof_link)] = 0.0
     for i in range(6):
         S[i, i] = 1.0
-    for d in range(dofs):
+        links[i] = 0
+    for d in range(len(table.dof_link)):
         link, axis = table.dof_link[d], table.dof_axis[d]
         a0, a1, a2 = R[link, 0, axis], R[link, 1, axis], R[link, 2, axis]
         o0, o1, o2 = t[0, 0] - t[link, 0], t[0, 1] - t[link, 1], t[0, 2] - t[link, 2]
         S[6 + d, 0], S[6 + d, 1], S[6 + d, 2] = a0, a1, a2
         S[6 + d, 3], S[6 + d, 4], S[6 + d, 5] = a1 * o2 - a2 * o1, a2 * o0 - a0 * o2, a0 * o1 - a1 * o0
+        links[6 + d] = link
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def project(H: Array, g: Array, S: Array, links: Array, table: JointTable, scale: float, A: Array, b: Array) -> None:
+    """A (K, K) and b (K,): link sums ``H`` (L, 6, 6), ``g`` (L, 6), child into parent, on the twists ``S`` (K, 6)."""
+    for link in range(len(H) - 1, 0, -1):
+        up = table.parents[link]
+        for i in range(6):
+            g[up, i] += g[link, i]
+            for j in range(6):
+                H[up, i, j] += H[link, i, j]
+    A[:] = 0.0
     y = np.empty(6)
-    for d in range(6 + dofs):
-        link = table.dof_link[d - 6] if d >= 6 else 0
+    for d in range(len(S)):
+        link = links[d]
         total = 0.0
         for i in range(6):
             total += S[d, i] * g[link, i]
@@ -182,8 +188,8 @@ def _project(H: Array, g: Array, R: Array, t: Array, table: JointTable, scale: f
             for j in range(6):
                 y[i] += H[link, i, j] * S[d, j]
         b[d] = scale * total
-        for e in range(d + 1):
-            if e >= 6 and not table.ancestor[table.dof_link[e - 6], link]:
+        for e in range(len(S)):
+            if not table.ancestor[links[e], link]:
                 continue
             total = 0.0
             for i in range(6):
@@ -258,6 +264,7 @@ def fit_pose(
     links, size = len(local), 6 + len(table.dof_link)
     H, g = np.empty((links, 6, 6)), np.empty((links, 6))
     A, b = np.empty((size, size)), np.empty(size)
+    S, moved = np.empty((size, 6)), np.empty(size, np.int64)
     near = np.empty((len(points), NEAR_LINKS), np.int8)
     link, row, d2 = np.empty(len(points), np.int64), np.empty(len(points), np.int64), np.empty(len(points))
     scale = 2500.0 / max(len(points), 1) / DATA_SIGMA_M**2
@@ -268,8 +275,9 @@ def fit_pose(
         if iteration % 3 == 0:
             near_links(points, R, t, surface, gate + 0.02, near)
         match_points(points, normals, near, R, t, surface, link, row, d2)
-        _normal_equations(points, link, row, d2, R, t, surface, gate, plan.point_share, H, g)
-        _project(H, g, R, t, table, scale, A, b)
+        normal_equations(points, link, row, d2, R, t, surface, gate, plan.point_share, H, g)
+        axis_twists(R, t, table, S, moved)
+        project(H, g, S, moved, table, scale, A, b)
         add_priors(root, local, predicted.root, predicted.local, table, plan.step_scale, plan.damping, A, b)
         _solve(A, b)
         _apply(b, root, local, table)
@@ -304,7 +312,7 @@ def judge_pose(
             for j in range(3):
                 x += R[c, i, j] * surface.points[k, j]
             off += a * (points[n, i] - x)
-        distance2 = off * off + ALONG_SHARE * max(d2[n] - off * off, 0.0)
+        distance2 = off * off + ALONG_SHARE * max(d2[n] - off * off - 2.0 * surface.spacing2_m2[c], 0.0)
         score += distance2 / (distance2 + INLIER_M**2)
         assigned[c] += 1.0
         if distance2 < INLIER_M**2:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from common.body.skeleton import LINK_COUNT, LINK_INDEX, LINK_PARENTS, Skeleton
 from common.body.skeleton_pose import bone_segments
 from common.geometry.point_cloud import PointCloud
-from sender.fitting.closest_point_grid import LinkGrid, Surface, build_link_grid
+from sender.fitting.closest_point_grid import LinkGrid, Surface, build_link_grid, shifted
 
 Array = NDArray[Any]
 
@@ -26,8 +26,13 @@ MAX_BYTES = 8_000_000
 MAX_POINTS_PER_LINK = 4_000
 CELL_M = 0.012  # one model point per cell and facing
 GRID_CELL_M, GRID_MARGIN_M = 0.020, 0.06
+THICK_M = 0.010  # standard deviation of a surface's height, by noise or by bending, from which it is thinned
+THICKNESS_SAMPLES = 64
+ALONG, ASIDE = 3, 2  # cells up and down, and to the sides, that count as around a cell
 MEMORY_FRAMES = 90.0  # a cell forgets what is older than about this many observations
 RARE = 0.3  # of the median count of a link's cells: fewer observations are noise
+UNSEEN_REACH = 1.5  # radii from the bone: what is further away may be anything
+CONFIRMED, FADING = 2.0, 0.97  # observations that make a late side surface; what is left of the others each time
 SEAM_WEIGHT = 0.4  # points a neighbouring link also claims bend with the joint and follow neither link well
 SEAM_RATIO = 1.35  # claimed by both when the second bone is at most this much further, in radii
 
@@ -56,15 +61,30 @@ class BodyModel:
         """Adds a cloud whose pose is ``T_world_link`` (L, 4, 4) [world]; each point goes to the bone it is nearest to,
         measured in that bone's radii, and near a joint to both bones. Links are taken in ``turns``: only those whose
         index leaves the remainder ``turn`` get their points."""
-        starts, ends = bone_segments(self.skeleton, T_world_link)
-        first, second, ratio = nearest_bones(cloud.positions, starts, ends, self.skeleton.radii)
-        first, second = _MOVER[first], _MOVER[second]
+        first, second, _, ratio = self._nearest_bones(cloud, T_world_link)
         seam = (ratio < SEAM_RATIO) & (first != second) & _JOINED[first, second]
         rows = np.concatenate([np.arange(len(first)), np.flatnonzero(seam)])
         links = np.concatenate([first, second[seam]])
         rows, links = rows[links % turns == turn], links[links % turns == turn]
         picked = PointCloud(cloud.positions[rows], cloud.normals[rows], cloud.colours[rows])
         self.add_assigned(picked, T_world_link, links, np.where(seam[rows], SEAM_WEIGHT, 1.0))
+
+    def add_unseen(self, cloud: PointCloud, T_world_link: Array, certain: Array) -> None:
+        """Adds points that the surface does not explain so far, a side that turned up late, to those ``certain`` (L,)
+        links they are close to. They count as surface once they were seen again; what is not seen again fades."""
+        first, _, near, _ = self._nearest_bones(cloud, T_world_link)
+        links = np.where(certain[first] & (near < UNSEEN_REACH), first, -1)
+        stale = self._stale.copy()
+        self.add_assigned(cloud, T_world_link, links, np.ones(len(links)))
+        self._stale = stale
+        for link in np.unique(links[links >= 0]):
+            if self._cells[link].confirm():
+                self._renew_later(int(link))
+
+    def _nearest_bones(self, cloud: PointCloud, T_world_link: Array) -> tuple[Array, Array, Array, Array]:
+        starts, ends = bone_segments(self.skeleton, T_world_link)
+        first, second, near, ratio = nearest_bones(cloud.positions, starts, ends, self.skeleton.radii)
+        return _MOVER[first], _MOVER[second], near, ratio
 
     def add_assigned(self, cloud: PointCloud, T_world_link: Array, links: Array, weights: Array) -> None:
         """Adds points whose link is known: ``links`` (N,) int, -1 = leave out; ``weights`` (N,) 0..1 rigidity."""
@@ -74,8 +94,31 @@ class BodyModel:
             points = (cloud.positions[chosen] - T[:3, 3]) @ T[:3, :3]
             normals = cloud.normals[chosen] @ T[:3, :3]
             self._cells[link].add(points, normals, cloud.colours[chosen].astype(np.float64), weights[chosen])
-            if int(link) not in self._stale:
-                self._stale.append(int(link))
+            self._renew_later(int(link))
+
+    def _renew_later(self, link: int) -> None:
+        if link not in self._stale:
+            self._stale.append(link)
+
+    def move_joints(self, in_parent: Array, in_link: Array) -> None:
+        """Moves joint centres: by ``in_parent`` (L, 3) [m] in the frames of their parents and by ``in_link`` (L, 3) [m]
+        in those of their own links, whose surfaces keep their place in the world's view of them: relative to the
+        centre they shift the other way."""
+        parents = np.array(LINK_PARENTS[1:])
+        offsets = self.skeleton.offsets.astype(np.float64)
+        offsets[1:] += in_parent[1:] - in_link[parents]
+        tips = self.skeleton.tips - in_link
+        for link in range(1, LINK_COUNT):  # a bone that ended where the next begins still does
+            parent = LINK_PARENTS[int(link)]
+            if np.array_equal(self.skeleton.tips[parent], self.skeleton.offsets[link]):
+                tips[parent] = offsets[link]
+        self.skeleton = Skeleton(offsets.astype(np.float32), tips.astype(np.float32), self.skeleton.radii)
+        for row, (cells, entry) in enumerate(zip(self._cells, self._grids, strict=True)):
+            if np.any(in_link[row]):
+                cells.shift(-in_link[row])
+                if entry is not None:
+                    self._grids[row] = shifted(entry[0], -in_link[row]), entry[1]
+        self._surface = None
 
     def surface(self, refreshed_links: int = LINK_COUNT) -> Surface:
         """All links' points and closest-point grids. At most ``refreshed_links`` links whose points changed get a new
@@ -182,11 +225,40 @@ class _LinkCells:
         self.keys, first = np.unique(keys, return_index=True)
         self.sums = sums[first]
 
+    def _often(self) -> Array:
+        """Which cells were seen often enough (M,) bool."""
+        if not len(self.sums):
+            return np.zeros(0, bool)
+        often: Array = self.sums[:, _COUNT] >= RARE * np.median(self.sums[:, _COUNT])
+        return often
+
+    def confirm(self) -> bool:
+        """Cells seen ``CONFIRMED`` times lately count as often seen; the rest of the rare ones fade. Whether any did
+        the former."""
+        rare = ~self._often()
+        seen = rare & (self.sums[:, _COUNT] >= CONFIRMED)
+        usual = RARE * np.median(self.sums[:, _COUNT]) + 1.0
+        self.sums[seen] *= (usual / self.sums[seen, _COUNT])[:, None]
+        self.sums[rare & ~seen] *= FADING
+        return bool(seen.any())
+
+    def shift(self, by: Array) -> None:
+        """Moves all points ``by`` (3,) [m]; what falls into one cell is one point from then on."""
+        sums = self.sums.copy()
+        sums[:, _POSITION] += sums[:, _COUNT:] * by
+        keys = _cell_keys(sums[:, _POSITION] / sums[:, _COUNT:], sums[:, _NORMAL])
+        self.keys, rows = np.unique(keys, return_inverse=True)
+        self.sums = np.zeros((len(self.keys), _COLUMNS))
+        _add_rows(rows, sums, self.sums)
+
     def surface(self) -> tuple[Array, Array, Array]:
         """Points (M, 3) [m, link frame], unit normals (M, 3) and rigidities (M,) of the cells that were seen often
-        enough: noise leaves cells that were hit once or twice around the true surface."""
-        often = self.sums[:, _COUNT] >= RARE * np.median(self.sums[:, _COUNT]) if len(self.sums) else slice(0)
+        enough: noise leaves cells that were hit once or twice around the true surface. A thick shell, as
+        noise of a centimetre leaves it, is thinned to one sheet in its middle."""
+        often = self._often()
         sums = self.sums[often]
+        if _thickness(self.keys, self.sums, often) > THICK_M:
+            sums = _sheet(self.keys, self.sums, often)
         count = sums[:, _COUNT:]
         normals = sums[:, _NORMAL] / np.maximum(np.linalg.norm(sums[:, _NORMAL], axis=1, keepdims=True), 1e-9)
         return sums[:, _POSITION] / count, normals, sums[:, _RIGID] / count[:, 0]
@@ -197,6 +269,59 @@ def _add_rows(targets: Array, rows: Array, sums: Array) -> None:
     for n in range(len(targets)):
         for column in range(rows.shape[1]):
             sums[targets[n], column] += rows[n, column]
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _height(keys: Array, sums: Array, n: int) -> tuple[float, float]:
+    """Mean and standard deviation [m] of the height, along its facing, of all that was seen around cell n."""
+    axis = (keys[n] >> 54) // 2
+    steps = np.array([1 << 36, 1 << 18, 1])
+    seen, height, square = 0.0, 0.0, 0.0
+    for u in range(-ASIDE, ASIDE + 1):
+        for v in range(-ASIDE, ASIDE + 1):
+            base = keys[n] + u * steps[(axis + 1) % 3] + v * steps[(axis + 2) % 3]
+            for w in range(-ALONG, ALONG + 1):
+                k = np.searchsorted(keys, base + w * steps[axis])
+                if k < len(keys) and keys[k] == base + w * steps[axis]:
+                    seen += sums[k, _COUNT]
+                    height += sums[k, axis]
+                    square += sums[k, axis] ** 2 / sums[k, _COUNT]
+    height /= seen
+    return height, np.sqrt(max(square / seen - height * height, 0.0))
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _thickness(keys: Array, sums: Array, often: Array) -> float:
+    """Mean standard deviation [m] of a surface's height around some of its cells (N,), ``often`` (N,) bool."""
+    total, count = 0.0, 0
+    for n in range(0, len(keys), max(len(keys) // THICKNESS_SAMPLES, 1)):
+        if often[n]:
+            total += _height(keys, sums, n)[1]
+            count += 1
+    return total / max(count, 1)
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _sheet(keys: Array, sums: Array, often: Array) -> Array:
+    """Sums (M, columns) of the cells that were seen most often of those above and below each other, at the mean height
+    of what is around them; ``keys`` (N,) sorted, ``often`` (N,) bool."""
+    out = np.empty_like(sums)
+    count = 0
+    steps = np.array([1 << 36, 1 << 18, 1])
+    for n in range(len(keys)):
+        axis = (keys[n] >> 54) // 2
+        most = often[n]
+        for w in range(-ALONG, ALONG + 1):
+            key = keys[n] + w * steps[axis]
+            k = np.searchsorted(keys, key)
+            if most and k < len(keys) and keys[k] == key:
+                less = sums[n, _COUNT] - sums[k, _COUNT]
+                most = less > 0.0 or (less == 0.0 and k >= n)
+        if most:
+            out[count] = sums[n]
+            out[count, axis] = _height(keys, sums, n)[0] * sums[n, _COUNT]
+            count += 1
+    return out[:count]
 
 
 def _cell_keys(points: Array, normals: Array) -> Array:
@@ -225,6 +350,7 @@ def _join(grids: list[LinkGrid], rigidity: list[Array]) -> Surface:
         nearest=np.concatenate([grid.nearest.ravel() for grid in grids]),
         low=low,
         high=high,
+        spacing2_m2=np.array([grid.spacing2_m2 for grid in grids], np.float32),
     )
 
 
@@ -247,11 +373,12 @@ _MOVER, _JOINED = _movers(), _joined()
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
-def nearest_bones(points: Array, starts: Array, ends: Array, radii: Array) -> tuple[Array, Array, Array]:
-    """Nearest and second nearest bone (N,), (N,) int64 of ``points`` (N, 3) [m, world] by distance ÷ radius, and the
-    ratio (N,) of the two distances; ``starts, ends`` (L, 3) [m, world], ``radii`` (L,) [m]."""
+def nearest_bones(points: Array, starts: Array, ends: Array, radii: Array) -> tuple[Array, Array, Array, Array]:
+    """Nearest and second nearest bone (N,), (N,) int64 of ``points`` (N, 3) [m, world] by distance ÷ radius, that
+    distance [radii] (N,), and the ratio (N,) of the two distances; ``starts, ends`` (L, 3) [m, world], ``radii`` (L,)
+    [m]."""
     first, second = np.empty(len(points), np.int64), np.empty(len(points), np.int64)
-    ratio = np.empty(len(points))
+    near, ratio = np.empty(len(points)), np.empty(len(points))
     for n in range(len(points)):
         best, next_best = np.inf, np.inf
         first[n] = second[n] = 0
@@ -270,5 +397,6 @@ def nearest_bones(points: Array, starts: Array, ends: Array, radii: Array) -> tu
                 best, next_best, second[n], first[n] = d, best, first[n], link
             elif d < next_best:
                 next_best, second[n] = d, link
+        near[n] = best
         ratio[n] = next_best / max(best, 1e-6)
-    return first, second, ratio
+    return first, second, near, ratio

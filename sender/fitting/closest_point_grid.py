@@ -18,6 +18,7 @@ Array = NDArray[Any]
 NORMAL_BINS = 6
 BIN_COSINE = 0.25  # a point is in every bin whose direction is within 75° of its normal
 NEAR_LINKS = 12  # candidate links a point may have
+SPACING_SAMPLES = 40
 NORMAL_GATE = 0.35  # least cosine between the normals of a point and its match
 MAX_CELLS = 3_500  # of each main direction: large links get coarser cells, which their flat surfaces allow
 
@@ -25,7 +26,8 @@ MAX_CELLS = 3_500  # of each main direction: large links get coarser cells, whic
 class LinkGrid(NamedTuple):
     """``points, normals`` (M, 3) float32 [m, link frame]; ``origin`` (3,) float32 [m]: corner of cell (0, 0, 0);
     ``cell_m``: edge; ``nearest`` (6, nx, ny, nz) int16: row of the closest point for a normal of that main direction
-    (+x, -x, +y, -y, +z, -z), -1 where the link has none; ``low, high`` (3,) float32: box of the points."""
+    (+x, -x, +y, -y, +z, -z), -1 where the link has none; ``low, high`` (3,) float32: box of the points;
+    ``spacing2_m2``: mean squared distance of a point from its nearest neighbour [m²]."""
 
     points: Array
     normals: Array
@@ -34,6 +36,7 @@ class LinkGrid(NamedTuple):
     nearest: Array
     low: Array
     high: Array
+    spacing2_m2: float
 
 
 def build_link_grid(points: Array, normals: Array, cell_m: float, margin_m: float) -> LinkGrid:
@@ -46,7 +49,7 @@ def build_link_grid(points: Array, normals: Array, cell_m: float, margin_m: floa
     points, normals = np.ascontiguousarray(points, np.float32), np.ascontiguousarray(normals, np.float32)
     if len(points) == 0:
         nothing, zero = np.full((NORMAL_BINS, 1, 1, 1), -1, np.int16), np.zeros(3, np.float32)
-        return LinkGrid(points, normals, zero, cell_m, nothing, zero, zero)
+        return LinkGrid(points, normals, zero, cell_m, nothing, zero, zero, 0.0)
     low, high = points.min(0), points.max(0)
     origin = (low - margin_m).astype(np.float32)
     extent = high + margin_m - origin
@@ -54,7 +57,36 @@ def build_link_grid(points: Array, normals: Array, cell_m: float, margin_m: floa
     shape = np.maximum(np.ceil(extent / cell_m).astype(np.int64), 1)
     nearest = np.full((NORMAL_BINS, *shape), -1, np.int16)
     _fill_nearest(points, normals, origin, np.float32(cell_m), nearest)
-    return LinkGrid(points, normals, origin, cell_m, nearest, low, high)
+    return LinkGrid(points, normals, origin, cell_m, nearest, low, high, _spacing2(points))
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _spacing2(points: Array) -> float:
+    """Mean squared distance to the nearest neighbour [m²], of about ``SPACING_SAMPLES`` of the points (M, 3)."""
+    step = max(len(points) // SPACING_SAMPLES, 1)
+    total, count = 0.0, 0
+    for n in range(0, len(points), step):
+        nearest = np.inf
+        for k in range(len(points)):
+            if k != n:
+                dx, dy, dz = (
+                    points[n, 0] - points[k, 0],
+                    points[n, 1] - points[k, 1],
+                    points[n, 2] - points[k, 2],
+                )
+                nearest = min(nearest, dx * dx + dy * dy + dz * dz)
+        if nearest < np.inf:
+            total += nearest
+            count += 1
+    return total / max(count, 1)
+
+
+def shifted(grid: LinkGrid, by: Array) -> LinkGrid:
+    """The grid with all its points moved ``by`` (3,) [m]."""
+    step = by.astype(np.float32)
+    return grid._replace(
+        points=grid.points + step, origin=grid.origin + step, low=grid.low + step, high=grid.high + step
+    )
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
@@ -121,7 +153,8 @@ class Surface(NamedTuple):
     ``points, normals`` (M, 3) float32 [m, link frame]; ``weights`` (M,) float32 0..1: how rigidly it follows;
     ``first_point`` (L,) int64; ``origin`` (L, 3) float32 [m]; ``shape`` (L, 3) int64; ``cells_per_m`` (L,) float32;
     ``first_cell`` (L,) int64; ``nearest`` (C,) int16, see ``closest_point_grid``;
-    ``low, high`` (L, 3) float32 [m, link frame]: box around the link's points; low > high when it has none.
+    ``low, high`` (L, 3) float32 [m, link frame]: box around the link's points; low > high when it has none;
+    ``spacing2_m2`` (L,) float32 [m²]: mean squared distance of a link's point from its nearest neighbour.
     """
 
     points: Array
@@ -135,6 +168,7 @@ class Surface(NamedTuple):
     nearest: Array
     low: Array
     high: Array
+    spacing2_m2: Array
 
 
 @njit(nogil=True, cache=True, error_model="numpy")

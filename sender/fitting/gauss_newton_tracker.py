@@ -12,17 +12,20 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from common.body.skeleton import LINK_COUNT, LINK_INDEX, SIDES, Skeleton
+from common.body.skeleton import LINK_COUNT, Skeleton
 from common.body.skeleton_pose import SkeletonPose, forward_kinematics
 from common.geometry import quaternion
 from common.geometry.point_cloud import PointCloud
 from sender.fitting.articulated_gauss_newton import FitArrays, PoseState, Schedule, forward
 from sender.fitting.body_fitter import BodyFitter
+from sender.fitting.body_learning import BodyLearning
 from sender.fitting.body_model import BodyModel
+from sender.fitting.fit_confidence import FitConfidence, ScoreScale
 from sender.fitting.initial_pose import NoPose
 from sender.fitting.initial_pose_search import InitialPoseSearch
 from sender.fitting.joint_limits import joint_table, turned_on
-from sender.fitting.limb_search import Limb, limbs, search_limb, thinned, within_reach
+from sender.fitting.limb_search import CLEARLY_BETTER, Limb, limbs, thinned, within_reach
+from sender.fitting.particle_recovery import BodyRecovery, LimbRecovery
 from sender.fitting.tracker import FitResult
 from sender.fitting.whole_body_search import WholeBodySearch
 
@@ -52,12 +55,8 @@ GUESS = Schedule(1, 0.20, 0.10, 0.2, 1.0, 1.0)
 COARSE = Schedule(2, 0.15, 0.08, 0.1, 1.0, 1.0)
 FINE = Schedule(2, 0.08, 0.06, 0.1, 1.0, 1.0)
 GUESS_POINTS, COARSE_POINTS, FINE_POINTS = 250, 600, 1250
-LEARN_TURNS = 3  # a cloud's points are learned for every third link, then for the next third of another cloud
 RETRY_FRAMES = 5  # after a limb search in vain
-SEEN_POINTS = 200  # with fewer explained points no pose is certain
-_FOLLOWS = {"neck": "head"} | {
-    f"{s}_{a}": f"{s}_{b}" for s in SIDES for a, b in (("fingers", "hand"), ("toes", "foot"))
-}
+GUESSED_SIGMA_M, KNOWN_SIGMA_M = 0.04, 0.005  # of joint centres found by the automatic start, and of given ones
 
 
 class GaussNewtonTracker:
@@ -73,9 +72,13 @@ class GaussNewtonTracker:
         self._state: PoseState | None = None
         self._before: PoseState | None = None  # the frame before: velocity
         self._times_ns = (0, 0)  # of the state and of the frame before
-        self._usual = np.zeros(LINK_COUNT)  # share of the cloud each link usually explains
+        self._scale = ScoreScale(settings.good_score, settings.lost_score)
+        self._good: PoseState | None = None  # the last pose that fitted well
+        self._confidence = FitConfidence()
+        self._learning: BodyLearning | None = None
+        self._limb_recovery: LimbRecovery | None = None
+        self._body_recovery: BodyRecovery | None = None
         self._result: FitResult | None = None
-        self._building_until_ns: int | None = None
         self._looking_since_ns: int | None = None
         self._good_ns = 0
         self._frames = 0
@@ -94,11 +97,16 @@ class GaussNewtonTracker:
 
     def start_from(self, skeleton: Skeleton, pose: SkeletonPose, cloud: PointCloud, capture_ns: int) -> FitResult:
         """Starts with sizes and pose known from elsewhere (a recording's own joints) and the cloud they belong to."""
+        return self._start(skeleton, pose, cloud, capture_ns, KNOWN_SIGMA_M)
+
+    def _start(
+        self, skeleton: Skeleton, pose: SkeletonPose, cloud: PointCloud, capture_ns: int, sigma_m: float
+    ) -> FitResult:
+        """A fresh body; ``sigma_m``: how well its joint centres are known."""
         self._body = BodyModel(skeleton)
         self._body.add(cloud, forward_kinematics(skeleton, pose))
-        self._begin(_state_of(pose), capture_ns)
-        self._building_until_ns = capture_ns + int(self._settings.building_s * 1e9)
-        fit = self._fitter().judge(cloud, _state_of(pose))
+        self._begin(_state_of(pose), capture_ns, capture_ns + int(self._settings.building_s * 1e9), sigma_m)
+        fit = self._fitter().judge(thinned(cloud, FINE_POINTS), _state_of(pose))
         return self._accept(fit, cloud, capture_ns)
 
     def track(self, cloud: PointCloud, capture_ns: int) -> FitResult | None:
@@ -110,7 +118,8 @@ class GaussNewtonTracker:
         if self._state is None:
             return self._look(cloud, capture_ns)
         fit = self._follow(cloud, capture_ns)
-        if fit.score < self._settings.lost_score:
+        self._scale.update(fit.score)
+        if fit.score < self._scale.lost:
             self._good_ns = capture_ns
         elif capture_ns - self._good_ns > self._settings.lost_s * 1e9:
             self._state = None
@@ -123,45 +132,73 @@ class GaussNewtonTracker:
         if self._looking_since_ns is None:
             self._looking_since_ns = capture_ns
         if self._search is not None:
-            fit = self._search.step(cloud)
-            if self._search.recognises(fit, cloud):
-                self._begin(fit.pose, capture_ns)
+            found = self._search.step(cloud)
+            if self._search.recognises(found, cloud):
+                fit = self._fitter().judge(thinned(cloud, FINE_POINTS), found.pose)
+                self._begin(fit.pose, capture_ns, 0, KNOWN_SIGMA_M)
                 return self._accept(fit, cloud, capture_ns)
-            self._status = f"looking for the known person: best score {fit.score:.2f}"
+            self._status = f"looking for the known person: best score {found.score:.2f}"
             if capture_ns - self._looking_since_ns < self._settings.stranger_s * 1e9:
                 return self._unseen()
-        found = self._newcomer.step(cloud, capture_ns)
-        if isinstance(found, NoPose):
-            self._status = f"looking for a person: {found.reason}"
+        first = self._newcomer.step(cloud, capture_ns)
+        if isinstance(first, NoPose):
+            self._status = f"looking for a person: {first.reason}"
             return self._unseen()
-        return self.start_from(found.skeleton, found.pose, cloud, capture_ns)
+        return self._start(first.skeleton, first.pose, cloud, capture_ns, GUESSED_SIGMA_M)
 
-    def _begin(self, state: PoseState, capture_ns: int) -> None:
+    def _begin(self, state: PoseState, capture_ns: int, building_until_ns: int, sigma_m: float) -> None:
         body = self._known_body()
         self._search = WholeBodySearch(body, self._table)
         self._newcomer = InitialPoseSearch(self._settings.floor_y)
-        self._state = self._before = state
+        self._state = self._before = self._good = state
         self._times_ns = (capture_ns, capture_ns)
-        self._usual = np.zeros(LINK_COUNT)
+        self._confidence = FitConfidence()
+        self._scale = ScoreScale(self._settings.good_score, self._settings.lost_score)
+        self._learning = BodyLearning(body, self._table, building_until_ns, sigma_m)
+        self._limb_recovery, self._body_recovery = None, None
         self._good_ns = capture_ns
         self._looking_since_ns = None
 
     def _follow(self, cloud: PointCloud, capture_ns: int) -> FitArrays:
-        """Velocity hypotheses on a tenth of the points, coarse then fine fit of the best, limbs that got lost."""
+        """Velocity hypotheses on a tenth of the points, coarse then fine fit of the best, then what got lost."""
         fitter = self._fitter()
         frames_passed = float(np.clip((capture_ns - self._times_ns[0]) / FRAME_NS, 1.0, 4.0))
         guess, coarse, fine = (plan._replace(step_scale=frames_passed) for plan in (GUESS, COARSE, FINE))
-        some = thinned(cloud, GUESS_POINTS)
+        some, judged = thinned(cloud, GUESS_POINTS), thinned(cloud, FINE_POINTS)
         guesses = self._predicted(capture_ns)
         fits = [fitter.fit(some, start, start, guess) for start in guesses]
         best = min(range(len(fits)), key=lambda k: fits[k].score)
         predicted = guesses[best]
         pose = fitter.move(thinned(cloud, COARSE_POINTS), fits[best].pose, predicted, coarse)
-        pose = fitter.move(thinned(cloud, FINE_POINTS), pose, predicted, fine)
-        fit = fitter.judge(cloud, pose)
-        for limb in self._limbs:  # one search a frame: with two, the frame would come too late
-            if self._is_lost(limb, fit, cloud):
-                return self._found(limb, fit, cloud)
+        fit = fitter.fit(judged, pose, predicted, fine)
+        return self._recovered(fit, judged, fitter)
+
+    def _recovered(self, fit: FitArrays, cloud: PointCloud, fitter: BodyFitter) -> FitArrays:
+        """The fit, or a better one: one limb is looked for at a time, or else the whole body when it fits badly."""
+        assert self._good is not None
+        if fit.score > self._scale.bad:
+            if self._body_recovery is None:
+                self._body_recovery = BodyRecovery(self._good, self._frames)
+            found = self._body_recovery.step(fit.pose, cloud, fitter)
+            other = fitter.fit(cloud, found, found, FINE)
+            if other.score < CLEARLY_BETTER * fit.score:
+                fit = other
+        else:
+            self._body_recovery = None
+        if self._limb_recovery is None:
+            lost = next((limb for limb in self._limbs if self._is_lost(limb, fit, cloud)), None)
+            if lost is None:
+                return fit
+            self._limb_recovery = LimbRecovery(lost, self._good, self._frames)
+        recovery = self._limb_recovery
+        pose = recovery.step(fit, cloud, fitter)
+        if pose is not None:
+            fit = fitter.fit(cloud, pose, pose, FINE)
+        still_lost = self._is_lost(recovery.limb, fit, cloud)
+        if recovery.ended and still_lost:
+            self._retry_after[recovery.limb.links[1]] = self._frames + RETRY_FRAMES
+        if recovery.ended or not still_lost:
+            self._limb_recovery = None
         return fit
 
     def _predicted(self, capture_ns: int) -> list[PoseState]:
@@ -188,7 +225,7 @@ class GaussNewtonTracker:
         """Whether the limb explains much less than usual while points in its reach, which it could explain, are left
         over."""
         outer = limb.links[1:]
-        usual = self._usual[outer].sum() * len(cloud)
+        usual = self._confidence.usual[outer].sum() * len(cloud)
         if fit.explained[outer].sum() > 0.4 * usual or self._frames < self._retry_after[outer[0]]:
             return False
         fitter = self._fitter()
@@ -196,64 +233,33 @@ class GaussNewtonTracker:
         left_over = within_reach(limb, joints, fitter.offsets, cloud) & (fit.owner < 0)
         return bool(left_over.sum() >= 0.4 * usual)
 
-    def _found(self, limb: Limb, fit: FitArrays, cloud: PointCloud) -> FitArrays:
-        """The fit, or a better one with the limb somewhere else."""
-        assert self._state is not None
-        fitter = self._fitter()
-        found = search_limb(limb, fit, cloud, fitter, (self._state,))
-        if found is fit.pose:
-            self._retry_after[limb.links[1]] = self._frames + RETRY_FRAMES
-            return fit
-        return fitter.fit(cloud, found, found, FINE)
-
     def _accept(self, fit: FitArrays, cloud: PointCloud, capture_ns: int) -> FitResult:
         """Takes the fit as the new state, lets the model learn from it, and says how it went."""
-        body = self._known_body()
+        skeleton = self._known_body().skeleton
         rotations = quaternion.from_matrix(fit.pose.local)
         local = quaternion.to_matrix(rotations)  # rounding must not add up over frames
         if capture_ns > self._times_ns[0]:
             self._before, self._times_ns = self._state, (capture_ns, self._times_ns[0])
         self._state = PoseState(fit.pose.root, local)
-        share = fit.explained / max(len(cloud), 1)
-        self._usual = np.where(share > self._usual, share, self._usual + 0.02 * (share - self._usual))
-        confidence = self._link_confidence(fit, len(cloud))
-        pose = SkeletonPose(fit.pose.root, rotations, confidence)
-        self._learn(fit, pose, cloud, capture_ns)
-        lost = self._settings.lost_score
-        sure = np.clip((lost - fit.score) / lost * 1.25, 0.0, 1.0) * min(fit.explained.sum() / SEEN_POINTS, 1.0)
+        good = fit.score < self._scale.good
+        if good:
+            self._good = self._state
+        pose = SkeletonPose(fit.pose.root, rotations, self._confidence.update(fit, len(fit.owner)))
+        assert self._learning is not None
+        building = self._learning.building(capture_ns)
+        self._status = "tracking, learning the surface" if building else "tracking"
+        if good:
+            self._learning.frame(fit, pose, cloud, thinned(cloud, FINE_POINTS), capture_ns)
         self._result = FitResult(
-            skeleton=body.skeleton,
+            skeleton=skeleton,
             pose=pose,
-            converged=fit.score < lost,
+            converged=fit.score < self._scale.lost,
             iterations=COARSE.iterations + FINE.iterations,
             inliers=fit.inliers,
             rms_m=fit.rms_m,
-            confidence=float(sure),
+            confidence=self._scale.confidence(fit),
         )
         return self._result
-
-    def _learn(self, fit: FitArrays, pose: SkeletonPose, cloud: PointCloud, capture_ns: int) -> None:
-        """While building, every other frame adds a good cloud's points to a third of the links; the frames between
-        renew one link's grid, so that no frame waits long."""
-        body = self._known_body()
-        self._status = "tracking" if self._building_until_ns is None else "tracking, learning the surface"
-        renew = self._frames % 2 == 1
-        if self._building_until_ns is not None:
-            if fit.score < self._settings.good_score and not renew:
-                turn = self._frames // 2 % LEARN_TURNS
-                body.add(cloud, forward_kinematics(body.skeleton, pose), turn, LEARN_TURNS)
-            if capture_ns >= self._building_until_ns:
-                self._building_until_ns = None
-        if renew:
-            body.surface(1)
-
-    def _link_confidence(self, fit: FitArrays, count: int) -> Array:
-        seen = fit.explained / np.maximum(fit.assigned, 1.0)
-        enough = np.clip(fit.explained / np.maximum(0.3 * self._usual * count, 6.0), 0.0, 1.0)
-        confidence = np.clip(seen * enough, 0.0, 1.0)
-        for link, leader in _FOLLOWS.items():  # too few points of their own to judge by
-            confidence[LINK_INDEX[link]] = confidence[LINK_INDEX[leader]]
-        return confidence.astype(np.float32)
 
     def _unseen(self) -> FitResult | None:
         """The last pose, not to be trusted; None when there never was one."""

@@ -94,7 +94,7 @@ def search_limb(
     """The best of ``fit`` and its retries with the limb turned, as it is in ``also``, or anywhere; ``fit.pose`` itself
     when nothing explains the cloud clearly better."""
     R, t = forward(fit.pose.root, fit.pose.local, fitter.offsets, fitter.table.parents)
-    rows = np.flatnonzero(within_reach(limb, t, fitter.offsets, cloud) & _free(limb, fit))
+    rows = free_rows(limb, fit, t, fitter.offsets, cloud)
     if len(rows) < 10:
         return fit.pose
     rows = rows[:: max(len(rows) // SCORED_POINTS, 1)]
@@ -109,7 +109,7 @@ def search_limb(
     some = thinned(cloud, RETRY_POINTS)
     best, best_score = fit.pose, CLEARLY_BETTER * fitter.judge(some, fit.pose).score
     for k in np.argsort(costs, kind="stable")[:RETRIES]:
-        start = _with_limb(fit.pose, limb, poses[k])
+        start = with_limb(fit.pose, limb, poses[k])
         retry = fitter.fit(some, start, start, RETRY)
         if retry.score < best_score:
             best, best_score = retry.pose, retry.score
@@ -123,12 +123,14 @@ def within_reach(limb: Limb, joints: Array, offsets: Array, cloud: PointCloud) -
     return near
 
 
-def _free(limb: Limb, fit: FitArrays) -> Array:
-    free: Array = (fit.owner < 0) | np.isin(fit.owner, limb.links)
-    return free
+def free_rows(limb: Limb, fit: FitArrays, joints: Array, offsets: Array, cloud: PointCloud) -> Array:
+    """Rows of the points within the limb's reach that the rest of the body does not explain."""
+    free = (fit.owner < 0) | np.isin(fit.owner, limb.links)
+    return np.flatnonzero(within_reach(limb, joints, offsets, cloud) & free)
 
 
-def _with_limb(state: PoseState, limb: Limb, pose: Array) -> PoseState:
+def with_limb(state: PoseState, limb: Limb, pose: Array) -> PoseState:
+    """``state`` with the limb's links at the local rotations ``pose`` (3, 3, 3)."""
     local = state.local.copy()
     local[limb.links] = pose
     return PoseState(state.root, local)
