@@ -199,6 +199,14 @@ def project(H: Array, g: Array, S: Array, links: Array, table: JointTable, scale
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
+def _project(H: Array, g: Array, R: Array, t: Array, table: JointTable, scale: float, A: Array, b: Array) -> None:
+    """``project`` on the root's twist and the joint axes."""
+    S, links = np.empty((len(b), 6)), np.empty(len(b), np.int64)
+    axis_twists(R, t, table, S, links)
+    project(H, g, S, links, table, scale, A, b)
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
 def _solve(A: Array, b: Array) -> None:
     """Solves A x = b in place of b by Cholesky; A (n, n) positive definite, its lower half is overwritten."""
     n = len(b)
@@ -264,7 +272,6 @@ def fit_pose(
     links, size = len(local), 6 + len(table.dof_link)
     H, g = np.empty((links, 6, 6)), np.empty((links, 6))
     A, b = np.empty((size, size)), np.empty(size)
-    S, moved = np.empty((size, 6)), np.empty(size, np.int64)
     near = np.empty((len(points), NEAR_LINKS), np.int8)
     link, row, d2 = np.empty(len(points), np.int64), np.empty(len(points), np.int64), np.empty(len(points))
     scale = 2500.0 / max(len(points), 1) / DATA_SIGMA_M**2
@@ -276,8 +283,7 @@ def fit_pose(
             near_links(points, R, t, surface, gate + 0.02, near)
         match_points(points, normals, near, R, t, surface, link, row, d2)
         normal_equations(points, link, row, d2, R, t, surface, gate, plan.point_share, H, g)
-        axis_twists(R, t, table, S, moved)
-        project(H, g, S, moved, table, scale, A, b)
+        _project(H, g, R, t, table, scale, A, b)
         add_priors(root, local, predicted.root, predicted.local, table, plan.step_scale, plan.damping, A, b)
         _solve(A, b)
         _apply(b, root, local, table)
