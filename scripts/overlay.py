@@ -1,8 +1,8 @@
-"""Draw the received skeletons over the recording they were found in: ``overlay.py RECORDING OUT.png [FRAMES]``.
+"""Draw the received skeletons over the recording they were found in: ``overlay.py RECORDING OUT.png [FRAMES OPTIONS]``
 
 Runs both daemons on the recording (once, as fast as frames are fitted) and makes a contact sheet of frames spread over
 it, by each camera in turn: depth in grey, silhouettes, or colour where there is some; joints that were not seen are
-left out.
+left out. The sender gets the OPTIONS, such as ``--tracker particles``.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory(prefix="telepose-overlay-") as folder, site(Path(folder)) as here:
         log = here.folder / "shown.log"
         receiver = here.receiver("--log-shown", str(log))
-        sender = here.sender("--recording", str(recording_path), "--as-fast-as-possible")
+        sender = here.sender("--recording", str(recording_path), "--as-fast-as-possible", *sys.argv[4:])
         assert sender.process.wait(300) == 0, sender.log
         assert receiver.end()[0] == 0, receiver.log
         session, epoch_ns = read_session(log), int(here.figures("sender")["source_epoch_ns"])

@@ -64,11 +64,11 @@ def test_the_follower_keeps_to_the_pose_and_says_how_sure_it_is():
     cloud = surface_points(hull_of(column(0.6, 0.6), column(-0.6, -0.5), cameras=around(6)), 4000)
     for x, z in ((0.6, 0.6), (-0.6, -0.5)):
         joints = np.array([centre for centre, _ in column(x, z)])
-        found = PersonFollower().find(cloud, around(6), joints)
+        found = PersonFollower().find(cloud, around(6), joints, 1 / 30)
         np.testing.assert_allclose(middle_of(cloud, found.chosen)[[0, 2]], [x, z], atol=0.1)
         assert found.certainty > 0.9
         assert found.volumes == 2
-    far = PersonFollower().find(cloud, around(6), np.array([[9.0, 0.0, 9.0]]))
+    far = PersonFollower().find(cloud, around(6), np.array([[9.0, 0.0, 9.0]]), 1 / 30)
     assert not far.chosen.any()
     assert far.certainty == 0
 
@@ -77,7 +77,7 @@ def test_two_bodies_that_touch_make_it_unsure_and_only_the_near_one_is_given():
     cloud = surface_points(hull_of(column(0.2, 0.0), column(-0.3, 0.0, 0.3), cameras=around(6)), 4000)
     assert connected_volumes(cloud.positions).max() == 0
     joints = np.array([centre for centre, _ in column(0.2, 0.0)])
-    found = PersonFollower().find(cloud, around(6), joints)
+    found = PersonFollower().find(cloud, around(6), joints, 1 / 30)
     assert 0.2 < found.certainty < 0.8
     assert cloud.positions[found.chosen, 0].min() > -0.2 > cloud.positions[:, 0].min()
 
@@ -85,13 +85,13 @@ def test_two_bodies_that_touch_make_it_unsure_and_only_the_near_one_is_given():
 def test_without_a_pose_it_stays_with_the_one_it_began_with():
     follower = PersonFollower()
     first = surface_points(hull_of(column(0.5, 0.5, 0.25), column(-0.6, -0.5), cameras=around(6)), 4000)
-    begun = middle_of(first, follower.find(first, around(6), None).chosen)
+    begun = middle_of(first, follower.find(first, around(6), None, 1 / 30).chosen)
     assert begun[0] > 0.3  # the larger
     second = surface_points(hull_of(column(0.5, 0.3), column(-0.6, -0.5, 0.25), cameras=around(6)), 4000)
-    assert middle_of(second, follower.find(second, around(6), None).chosen)[0] > 0.3
+    assert middle_of(second, follower.find(second, around(6), None, 1 / 30).chosen)[0] > 0.3
 
 
 def test_no_points_are_nobody():
     empty = np.zeros((0, 3), np.float32)
-    found = PersonFollower().find(PointCloud(empty, empty, empty.astype(np.uint8)), CAMERAS, None)
+    found = PersonFollower().find(PointCloud(empty, empty, empty.astype(np.uint8)), CAMERAS, None, 0.0)
     assert (found.certainty, found.volumes, len(found.chosen)) == (0.0, 0, 0)

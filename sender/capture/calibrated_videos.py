@@ -72,20 +72,21 @@ class _Video:
     def __init__(self, file: Path, camera: Camera) -> None:
         self._file = file
         self._lock = threading.Lock()  # several threads decode ahead
-        self._video = cv2.VideoCapture(str(file)) if file.is_file() else None
-        count = int(self._video.get(cv2.CAP_PROP_FRAME_COUNT)) if self._video is not None else 0
-        if not 0 < count < _MOST_FRAMES:
+        video = cv2.VideoCapture(str(file)) if file.is_file() else None
+        count = int(video.get(cv2.CAP_PROP_FRAME_COUNT)) if video is not None else 0
+        if video is None or not 0 < count < _MOST_FRAMES:
             raise CaptureError(f"{file}: no video with frames")
-        assert self._video is not None
-        width, height = (int(self._video.get(p)) for p in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
+        width, height = (int(video.get(what)) for what in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
         if (width, height) != (camera.width, camera.height):
             raise CaptureError(f"{file}: {width}×{height}, not {camera.width}×{camera.height}")
-        self.numbers = range(count)
-        self._next = 0
+        self._video = video
+        self._next = sum(1 for _ in iter(video.grab, False))  # a header may promise more than there are
+        if self._next == 0:
+            raise CaptureError(f"{file}: no frame can be decoded")
+        self.numbers = range(self._next)
 
     def load(self, number: int) -> tuple[None, NDArray[np.uint8]]:
         with self._lock:
-            assert self._video is not None
             if not self._next <= number <= self._next + _SKIPPED:
                 self._video.set(cv2.CAP_PROP_POS_FRAMES, number)
                 self._next = number
@@ -124,15 +125,7 @@ def _images(folder: Path, camera: Camera) -> _Video | _Silhouettes:
 def _room(file: Path, camera: Camera) -> NDArray[np.uint8]:
     """Frames (F, H, W, 3) uint8 RGB."""
     video = _Video(file, camera)
-    frames = []
-    for number in video.numbers[:: max(len(video.numbers) // _ROOM_FRAMES, 1)]:
-        try:
-            frames.append(video.load(number)[1])
-        except CaptureError:  # a header may promise a frame or two more than there are
-            break
-    if not frames:
-        raise CaptureError(f"{file}: no frame can be decoded")
-    return np.stack(frames)
+    return np.stack([video.load(n)[1] for n in video.numbers[:: max(len(video.numbers) // _ROOM_FRAMES, 1)]])
 
 
 def _camera(name: str, width: int, height: int, record: dict[str, Any]) -> Camera:

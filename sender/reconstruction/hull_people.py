@@ -24,7 +24,7 @@ BLOCKS_ACROSS = 64  # of an image, in which volumes are told apart
 LEAST_SHARE = 0.02  # smaller volumes are splinters where outlines graze each other
 LEAST_HEIGHT_M, MOST_WIDTH_M = 0.8, 1.3  # of a person, arms not spread; who spreads them is there alone
 OWN_PIXELS = 0.4  # share of its image, in some camera, that makes a volume real beyond doubt
-REACH_M = 0.35  # from the last pose: how far a body's surface and its motion since go
+REACH_M, SPEED_MPS = 0.28, 2.0  # a body's surface from its joints; how fast they go
 LEAP_M = 0.7  # from where somebody was that had no pose yet
 
 
@@ -44,9 +44,12 @@ class PersonFollower:
     def __init__(self) -> None:
         self._middle: Floats | None = None  # of the person's points last time
 
-    def find(self, cloud: PointCloud, cameras: Sequence[Camera], last_joints: Floats | None) -> HullPerson:
-        """The person among the hull's points. ``last_joints`` (J, 3) [m, world]: where the pose was last, if known:
-        then the volume there, cut to what is in reach of it; else the one found last time; else the most real one."""
+    def find(
+        self, cloud: PointCloud, cameras: Sequence[Camera], last_joints: Floats | None, since_s: float
+    ) -> HullPerson:
+        """The person among the hull's points. ``last_joints`` (J, 3) [m, world]: where the pose was ``since_s`` ago, if
+        known: then the volume there, cut to what is in reach of it; else the one found last time; else the most real
+        one."""
         volumes = connected_volumes(cloud.positions)
         count = int(volumes.max(initial=-1)) + 1
         if count == 0:
@@ -54,7 +57,7 @@ class PersonFollower:
         real = realness(cloud.positions, volumes, cameras)
         near = np.ones(len(cloud), np.bool_)
         if last_joints is not None:
-            near = _distances(cloud.positions, last_joints) < REACH_M
+            near = _distances(cloud.positions, last_joints) < REACH_M + SPEED_MPS * since_s
         chosen = self._choose(cloud.positions, volumes, real, near, last_joints is not None)
         mine = (volumes == chosen) & near
         if not mine.any():

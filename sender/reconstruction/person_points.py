@@ -21,6 +21,7 @@ from sender.reconstruction.hull_points import surface_points, volume_points
 from sender.reconstruction.silhouette import SilhouetteModel, SilhouetteSettings
 from sender.reconstruction.visual_hull import VisualHull
 
+LONGEST_S = 0.3  # after a longer gap somebody is looked for no farther
 MOST_POINTS = 4  # times the budget, when the person is only a part of the hull
 
 
@@ -80,7 +81,8 @@ class HullReconstruction:
         self._points = points
         self._inside = inside
         self._follower = PersonFollower()
-        self._share = 1.0  # of the hull's points that were the person's
+        self._share = 1 / MOST_POINTS  # of the hull's points that were the person's; at first there may be many people
+        self._last_ns = 0
 
     def person(self, frames: FrameSet, last_joints: NDArray[np.floating] | None, timer: StageTimer) -> PersonPoints:
         """See ``Reconstruction``. Cameras whose frame is missing do without; from fewer than two nothing is seen."""
@@ -95,7 +97,9 @@ class HullReconstruction:
             sampled = volume_points if self._inside and last_joints is not None else surface_points
             cloud = sampled(hull, int(self._points / self._share))
         with timer.stage("person"):
-            found = self._follower.find(cloud, hull.cameras, last_joints)
+            since_s = float(np.clip((frames.capture_ns - self._last_ns) / 1e9, 0.0, LONGEST_S))
+            self._last_ns = frames.capture_ns
+            found = self._follower.find(cloud, hull.cameras, last_joints, since_s)
             mine = np.flatnonzero(found.chosen)
             self._share = float(np.clip(len(mine) / max(len(cloud), 1), 1 / MOST_POINTS, 1.0))
             if len(mine) > self._points:
