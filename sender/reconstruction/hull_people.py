@@ -24,7 +24,7 @@ BLOCKS_ACROSS = 64  # of an image, in which volumes are told apart
 LEAST_SHARE = 0.02  # smaller volumes are splinters where outlines graze each other
 LEAST_HEIGHT_M, MOST_WIDTH_M = 0.8, 1.3  # of a person, arms not spread; who spreads them is there alone
 OWN_PIXELS = 0.4  # share of its image, in some camera, that makes a volume real beyond doubt
-REACH_M, SPEED_MPS = 0.28, 2.0  # a body's surface from its joints; how fast they go
+REACH_M, SPEED_MPS = 0.28, 1.5  # a body's surface from its joints; how fast they go
 LEAP_M = 0.7  # from where somebody was that had no pose yet
 
 
@@ -55,11 +55,11 @@ class PersonFollower:
         if count == 0:
             return HullPerson(np.zeros(len(cloud), np.bool_), 0.0, 0)
         real = realness(cloud.positions, volumes, cameras)
-        near = np.ones(len(cloud), np.bool_)
-        if last_joints is not None:
-            near = _distances(cloud.positions, last_joints) < REACH_M + SPEED_MPS * since_s
-        chosen = self._choose(cloud.positions, volumes, real, near, last_joints is not None)
-        mine = (volumes == chosen) & near
+        away = np.zeros(len(cloud)) if last_joints is None else _distances(cloud.positions, last_joints)
+        reach_m = REACH_M + SPEED_MPS * since_s
+        place_m = REACH_M if (away < REACH_M).any() else reach_m  # who stands where the pose was, not who comes near
+        chosen = self._choose(cloud.positions, volumes, real, away < place_m, last_joints is not None)
+        mine = (volumes == chosen) & (away < reach_m)
         if not mine.any():
             return HullPerson(mine, 0.0, count)
         self._middle = cloud.positions[mine].mean(axis=0)
