@@ -88,33 +88,34 @@ def test_the_points_lie_around_the_person_and_inside_only_once_there_is_a_pose()
 
 def test_missing_cameras_and_an_empty_room_are_survived():
     path = skeleton_path()
-    for sequence in range(1, 5):
+    for sequence in range(1, 10):
         path.process(colour_frames(sequence))
-    full = colour_frames(5)
+    full = colour_frames(10)
     fewer = path.process(FrameSet(full.capture_ns, (None, *full.frames[1:])))
     assert fewer.fit is not None
     assert fewer.fit.confidence > 0.2
     assert not fewer.complete
-    for sequence, frames in ((6, (None, None, None, full.frames[3])), (7, (None,) * 4)):
+    for sequence, frames in ((11, (None, None, None, full.frames[3])), (12, (None,) * 4)):
         alone = path.process(FrameSet(round(sequence / RATE_HZ * 1e9), frames))
         assert alone.fit is not None
         assert alone.fit.confidence == 0
-    empty = (ColourFrame(index, 8, 0, room[0]) for index, room in enumerate(rooms()))
-    nobody = path.process(FrameSet(round(8 / RATE_HZ * 1e9), tuple(empty)))
+    empty = (ColourFrame(index, 13, 0, room[0]) for index, room in enumerate(rooms()))
+    nobody = path.process(FrameSet(round(13 / RATE_HZ * 1e9), tuple(empty)))
     assert nobody.fit is not None
     assert nobody.fit.confidence == 0
 
 
 def test_a_hull_that_is_not_surely_the_persons_lowers_the_packets_confidence(monkeypatch: pytest.MonkeyPatch):
     path = skeleton_path()
-    sure = path.process(colour_frames(1))
+    for sequence in range(1, 10):
+        sure = path.process(colour_frames(sequence))
     person = HullReconstruction.person
 
     def unsure(self, *arguments):
         return dataclasses.replace(person(self, *arguments), certainty=0.25)
 
     monkeypatch.setattr(HullReconstruction, "person", unsure)
-    doubtful = path.process(colour_frames(2))
+    doubtful = path.process(colour_frames(10))
     assert sure.packet is not None
     assert doubtful.packet is not None
     assert doubtful.fit is not None
