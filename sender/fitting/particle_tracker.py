@@ -20,7 +20,9 @@ from common.geometry.point_cloud import PointCloud
 from sender.fitting.annealed_particle_filter import AnnealingSettings
 from sender.fitting.articulated_gauss_newton import PoseState, Schedule
 from sender.fitting.body_model import BodyModel
-from sender.fitting.initial_pose import NoPose, find_initial_pose
+from sender.fitting.body_outline import NoPose
+from sender.fitting.initial_pose import find_initial_pose
+from sender.fitting.initial_pose_search import InitialPoseSearch
 from sender.fitting.joint_limits import joint_table, turned_on
 from sender.fitting.limb_search import thinned
 from sender.fitting.particle_weights import ParticleWeights, numba_weights
@@ -38,6 +40,7 @@ HYPOTHESES = (1.0, 0.0)  # shares of the last velocity
 COARSE = Schedule(3, 0.20, 0.10, 0.0, 1.0, 1.0)
 FINE = Schedule(4, 0.12, 0.08, 0.0, 1.0, 1.0)
 CLEARLY_BETTER = 0.96  # cost of the particles' pose over that of plain motion: ghosts of a hull are no reason to jump
+GUESS_AFTER_S = 1.5
 FEW_POINTS = 6.0  # an ellipsoid with fewer is not seen
 _LEGS = tuple(LINK_INDEX[f"{side}_{part}"] for side in SIDES for part in ("thigh", "shin", "foot"))
 _FILLED_WITH = tuple(  # one ellipsoid for both
@@ -73,6 +76,8 @@ class ParticleTracker:
         self._weights, self._settings = weights, settings
         self._table = joint_table()
         self._skeleton: Skeleton | None = None
+        self._search = InitialPoseSearch()
+        self._looking_since_ns: int | None = None
         self._status = "looking for a person"
         self._result: FitResult | None = None
 
@@ -93,6 +98,7 @@ class ParticleTracker:
             shown = ~np.isin(ellipsoids.links, _LEGS)
             ellipsoids = Ellipsoids(*(array[shown] for array in ellipsoids))
         self._skeleton, self._ellipsoids = skeleton, ellipsoids
+        self._looking_since_ns = None
         self._offsets = skeleton.offsets.astype(np.float64)
         self._particles = WholeBodyParticles(skeleton, ellipsoids, self._table, self._weights, self._settings.annealing)
         state = PoseState(
@@ -112,11 +118,7 @@ class ParticleTracker:
             self._status = f"{len(cloud)} points: nobody to see"
             return self._unseen()
         if self._skeleton is None:
-            found = find_initial_pose(cloud)
-            if isinstance(found, NoPose):
-                self._status = f"looking for a person: {found.reason}"
-                return self._unseen()
-            return self.start_from(found.skeleton, found.pose, cloud, capture_ns)
+            return self._look(cloud, capture_ns)
         fit = self._follow(thinned(cloud, FIT_POINTS), capture_ns)
         if fit.score < self._settings.lost_score:
             self._good_ns = capture_ns
@@ -125,6 +127,19 @@ class ParticleTracker:
             self._status = "lost: looking for the person"
             return self._unseen()
         return self._accept(fit, cloud, capture_ns)
+
+    def _look(self, cloud: PointCloud, capture_ns: int) -> FitResult | None:
+        """The search over frames where normals tell sides apart; else, or after a while, the best guess there is: a
+        hull's ghosts keep the search from ever being certain."""
+        if self._looking_since_ns is None:
+            self._looking_since_ns, self._search = capture_ns, InitialPoseSearch()
+        found = self._search.step(cloud, capture_ns) if cloud.normals.any() else find_initial_pose(cloud)
+        if isinstance(found, NoPose) and capture_ns - self._looking_since_ns > GUESS_AFTER_S * 1e9:
+            found = find_initial_pose(cloud)
+        if isinstance(found, NoPose):
+            self._status = f"looking for a person: {found.reason}"
+            return self._unseen()
+        return self.start_from(found.skeleton, found.pose, cloud, capture_ns)
 
     def _follow(self, cloud: PointCloud, capture_ns: int) -> EllipsoidFit:
         """The best of the velocity hypotheses, then particles around it; the better of both."""

@@ -82,6 +82,8 @@ class Part:
             self.body,
             offsets=offsets,
             zero=np.ascontiguousarray(pose.local[self.body.links]),
+            low=np.full(self.body.dof_count, -np.inf),  # limits are the polish's: these angles start elsewhere
+            high=np.full(self.body.dof_count, np.inf),
             ellipsoid_link=np.array([first_of[int(link)] for link in at]),
             centres=np.einsum("eij,ej->ei", turned, centres),
             directions=turned @ R[links] @ self._ellipsoids.directions[self.rows],
