@@ -2,8 +2,10 @@
 
 Each of the SDK's 20 joints is compared with a point fixed to one of our links; which point, is learned from the other
 sequences of the same subject (median of the SDK's joint in the link's frame), since the SDK's joints are not ours. The
-SDK's own error is centimetres. Frames without a skeleton count as lost. ``frozen_ratio``: of the joints that come more
-than 20 cm from where they began, the mean error over that of the SDK's own first skeleton, kept still.
+SDK's own error is centimetres. ``lost_share``: of the frames from the first skeleton on, those with a median distance
+over 20 cm or without a skeleton; ``before_start_share``: of all frames, those before it. ``frozen_ratio``: of the
+joints that come more than 20 cm from where they began, the mean error over that of the SDK's own first skeleton, kept
+still.
 """
 
 from __future__ import annotations
@@ -138,6 +140,7 @@ def offsets_for(tracks: list[Track], judged: Track) -> Floats:
 def _rows(case: str, tracks: list[Track], errors: list[Floats]) -> list[Row]:
     distances = np.concatenate(errors)
     there = np.isfinite(distances[:, 0])
+    begun = np.concatenate([np.maximum.accumulate(np.isfinite(error[:, 0])) for error in errors])
     of_frame = np.where(there, np.median(distances, axis=1), np.inf)
     ours, frozen = (np.concatenate(part) for part in zip(*map(moving, tracks, errors), strict=True))
     cpu_ms = np.concatenate([track.cpu_ms for track in tracks])
@@ -145,8 +148,8 @@ def _rows(case: str, tracks: list[Track], errors: list[Floats]) -> list[Row]:
         ("joint_distance_median", float(np.median(distances[there])) if there.any() else None, "m"),
         ("joint_distance_p90", float(np.percentile(distances[there], 90)) if there.any() else None, "m"),
         ("frozen_ratio", float(ours.mean() / frozen.mean()) if len(ours) else None, "1"),
-        ("lost_share", float((of_frame > LOST_M).mean()), "1"),
-        ("no_skeleton_share", float((~there).mean()), "1"),
+        ("lost_share", float((of_frame > LOST_M)[begun].mean()) if begun.any() else 1.0, "1"),
+        ("before_start_share", float((~begun).mean()), "1"),
         ("ms_per_frame_p50", float(np.percentile(cpu_ms, 50)), "ms (CPU of the thread)"),
         ("ms_per_frame_p99", float(np.percentile(cpu_ms, 99)), "ms (CPU of the thread)"),
     ]

@@ -199,7 +199,9 @@ def project(H: Array, g: Array, S: Array, links: Array, table: JointTable, scale
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
-def _project(H: Array, g: Array, R: Array, t: Array, table: JointTable, scale: float, A: Array, b: Array) -> None:
+def project_on_axes(
+    H: Array, g: Array, R: Array, t: Array, table: JointTable, scale: float, A: Array, b: Array
+) -> None:
     """``project`` on the root's twist and the joint axes."""
     S, links = np.empty((len(b), 6)), np.empty(len(b), np.int64)
     axis_twists(R, t, table, S, links)
@@ -207,7 +209,7 @@ def _project(H: Array, g: Array, R: Array, t: Array, table: JointTable, scale: f
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
-def _solve(A: Array, b: Array) -> None:
+def solve(A: Array, b: Array) -> None:
     """Solves A x = b in place of b by Cholesky; A (n, n) positive definite, its lower half is overwritten."""
     n = len(b)
     for j in range(n):
@@ -230,7 +232,7 @@ def _solve(A: Array, b: Array) -> None:
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
-def _apply(x: Array, root: Array, local: Array, table: JointTable) -> None:
+def apply_step(x: Array, root: Array, local: Array, table: JointTable) -> None:
     """Moves the pose by the solution x (6+D,); steps are cut at half a radian and 20 cm."""
     v, M, old = np.zeros(3), np.empty((3, 3)), np.empty((3, 3))
     for i in range(3):
@@ -283,10 +285,10 @@ def fit_pose(
             near_links(points, R, t, surface, gate + 0.02, near)
         match_points(points, normals, near, R, t, surface, link, row, d2)
         normal_equations(points, link, row, d2, R, t, surface, gate, plan.point_share, H, g)
-        _project(H, g, R, t, table, scale, A, b)
+        project_on_axes(H, g, R, t, table, scale, A, b)
         add_priors(root, local, predicted.root, predicted.local, table, plan.step_scale, plan.damping, A, b)
-        _solve(A, b)
-        _apply(b, root, local, table)
+        solve(A, b)
+        apply_step(b, root, local, table)
         gate *= shrink
     return PoseState(root, local)
 

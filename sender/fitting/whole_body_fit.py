@@ -14,7 +14,14 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from sender.fitting.articulated_gauss_newton import PoseState, Schedule, _apply, _project, _solve, forward
+from sender.fitting.articulated_gauss_newton import (
+    PoseState,
+    Schedule,
+    apply_step,
+    forward,
+    project_on_axes,
+    solve,
+)
 from sender.fitting.joint_limits import JointTable, add_priors
 from sender.fitting.whole_body_ellipsoids import Ellipsoids, unit_maps
 
@@ -152,10 +159,10 @@ def fit_ellipsoids(
         unit_maps(R, t, ellipsoids, maps)
         nearest_ellipsoids(points, normals, maps, bias, owner, distance)
         _normal_equations(points, normals, owner, distance, maps, ellipsoids, root, gate, H, g)
-        _project(H, g, R, t, table, scale, A, b)
+        project_on_axes(H, g, R, t, table, scale, A, b)
         add_priors(root, local, predicted.root, predicted.local, table, plan.step_scale, plan.damping, A, b)
-        _solve(A, b)
-        _apply(b, root, local, table)
+        solve(A, b)
+        apply_step(b, root, local, table)
         gate *= shrink
     return PoseState(root, local)
 
