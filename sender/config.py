@@ -35,6 +35,8 @@ class CaptureSettings:
     def __post_init__(self) -> None:
         if self.source == "recording" and self.recording is None:
             raise ValueError("recording: a recording source needs a folder or file")
+        if self.source == "recording" and not self.depth:
+            raise ValueError("depth: a recording has depth or has none, whatever is set here")
         if self.source == "rig" and self.rig_socket is None:
             raise ValueError("rig_socket: attaching to a rig needs the path of its socket")
         if not 1 <= self.cameras <= 16:

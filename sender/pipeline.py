@@ -26,7 +26,7 @@ from sender.capture.frame_set import FrameSet
 from sender.config import CandidateSettings
 from sender.fitting.outside_tracker import OutsideTracker
 from sender.fitting.start_joints import skeleton_from_joints
-from sender.fitting.tracker import FitResult, Tracker
+from sender.fitting.tracker import MINIMUM_POINTS, FitResult, Tracker
 from sender.reconstruction.person_points import Reconstruction
 
 BODY_CHANGE_M = 0.001  # sizes that differ by less are the same body to a receiver
@@ -94,7 +94,10 @@ class SkeletonPath:
             fit = self._fit(person.cloud, frames.capture_ns)
         if fit is None:
             return TrackedFrame(frames.capture_ns, person.views, None)
-        fit = replace(fit, confidence=fit.confidence * person.certainty)
+        if person.certainty < 1:  # a ghost's joints are as doubtful as the ghost
+            doubted = (fit.pose.confidence * person.certainty).astype(np.float32)
+            pose = SkeletonPose(fit.pose.root_position, fit.pose.rotations, doubted)
+            fit = replace(fit, pose=pose, confidence=fit.confidence * person.certainty)
         with self._timer.stage("packet"):
             return self._pack(frames, person.views, fit)
 
@@ -107,7 +110,7 @@ class SkeletonPath:
             return self._pack(frames, (), fit)
 
     def _fit(self, cloud: PointCloud, capture_ns: int) -> FitResult | None:
-        if self._start_joints is None or len(cloud) == 0:
+        if self._start_joints is None or len(cloud) < MINIMUM_POINTS:
             return self._tracker.track(cloud, capture_ns)
         skeleton, pose = skeleton_from_joints(self._start_joints)
         self._start_joints = None

@@ -140,6 +140,24 @@ def test_a_joint_that_was_never_seen_is_not_a_number():
     assert np.isfinite(np.delete(result.joints, row_of("left_foot"), axis=0)).all()
 
 
+def test_a_joint_that_is_not_seen_after_a_pause_spoils_no_other_and_comes_back():
+    merger = SkeletonMerger("kinect-v2", SENSORS)
+    for instant in instants_of(truth(60), truth(60)):
+        merger.merge(instant)
+    foot = row_of("left_foot")
+    hidden = np.ones(25)
+    hidden[foot] = 0.0
+    for frame in range(80, 90):  # the pause is over 0.3 s
+        joints = merger.merge(
+            (seen(frame, 0, person_at(frame), hidden), seen(frame, 1, person_at(frame), hidden))
+        ).joints
+        assert np.isfinite(np.delete(joints, foot, axis=0)).all()
+    for frame in range(90, 100):  # one of them sees it again
+        joints = merger.merge((seen(frame, 0, person_at(frame)), seen(frame, 1, person_at(frame), hidden))).joints
+    assert np.isfinite(joints).all()
+    assert np.linalg.norm(joints[foot] - person_at(99)[foot]) < 0.03
+
+
 def test_after_an_absence_somebody_else_has_other_bones_but_the_same_person_keeps_theirs():
     def lengths_after(scale: float) -> tuple[np.ndarray, np.ndarray]:
         merger = SkeletonMerger("kinect-v2", SENSORS)

@@ -16,7 +16,6 @@ from common.body.link_segmentation import bone_metric
 from common.body.skeleton import LINK_COUNT, LINK_PARENTS, Skeleton
 
 BAND = 0.3  # of a link's thickness, either side of the border
-FULL = 255
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -50,7 +50,7 @@ class CalibratedVideos:
                 raise ValueError("no cameras")
         except KeyError as error:
             raise CaptureError(f"{file}: {error} is missing") from None
-        except (ValueError, TypeError, AttributeError) as error:
+        except (ValueError, TypeError, AttributeError, OverflowError) as error:
             raise CaptureError(f"{file}: {error}") from None
         self._images = [_images(path / camera.name, camera) for camera in self.cameras]
         self.empty_room: tuple[NDArray[np.uint8] | None, ...] = tuple(
@@ -125,7 +125,7 @@ def _images(folder: Path, camera: Camera) -> _Video | _Silhouettes:
 def _room(file: Path, camera: Camera) -> NDArray[np.uint8]:
     """Frames (F, H, W, 3) uint8 RGB."""
     video = _Video(file, camera)
-    return np.stack([video.load(n)[1] for n in video.numbers[:: max(len(video.numbers) // _ROOM_FRAMES, 1)]])
+    return np.stack([video.load(n)[1] for n in video.numbers[:: -(-len(video.numbers) // _ROOM_FRAMES) or 1]])
 
 
 def _camera(name: str, width: int, height: int, record: dict[str, Any]) -> Camera:
@@ -133,7 +133,7 @@ def _camera(name: str, width: int, height: int, record: dict[str, Any]) -> Camer
     along_mm, distortion = np.array(record["t_world_to_cam_mm"], float), np.array(record["dist_k1k2p1p2k3"], float)
     if matrix.shape != (3, 3) or rotation.shape != (3, 3) or along_mm.shape != (3,):
         raise ValueError(f"camera {name}: K, R_world_to_cam or t_world_to_cam_mm has the wrong size")
-    if Path(name).name != name:
+    if Path(name).name != name or name in ("", ".", ".."):
         raise ValueError(f"camera {name!r} is not a folder's name")
     pose = _Y_UP_FROM_Z_UP @ inverse(rigid_transform(rotation, along_mm / 1000))
     fx, fy, cx, cy = (float(matrix[place]) for place in ((0, 0), (1, 1), (0, 2), (1, 2)))

@@ -21,6 +21,7 @@ Floats = NDArray[np.float64]
 
 _COLUMNS = ("Tracker_Time", "Skeleton_Time", "Skeleton_Init_Angle", "Skeleton_Init_Dist", "Kinect#", "Kinect_Height")
 _TICK_NS, _MS_NS = 100, 1_000_000
+_MOST_MS = 1 << 48  # since the year 1
 _RATE_HZ = 30.0
 
 
@@ -114,6 +115,8 @@ def _table_rows(table: Iterator[list[str]]) -> Iterator[_Row]:
             joints = np.array([float(cells[place]) for place in places]).reshape(-1, 3)
             tracker, ticks, angle, distance, sensor, height = (cells[place] for place in at)
             row = _Row(int(tracker), int(ticks), float(angle), float(distance), sensor, float(height) / 100, joints)
+            if not (abs(row.tracker_ms) < _MOST_MS and abs(row.skeleton_ticks) < _MOST_MS * _MS_NS // _TICK_NS):
+                raise ValueError("a time is out of range")
             if not (np.isfinite([row.angle_rad, row.distance_m, row.height_m]).all() and np.isfinite(joints).all()):
                 raise ValueError("a number is not finite")
             yield row

@@ -93,7 +93,7 @@ class RecordingFolder:
             times = [_times(f, r, self.frame_rate_hz) for f, r in zip(self._folders, content["cameras"], strict=True)]
         except KeyError as error:
             raise CaptureError(f"{file}: {error} is missing") from None
-        except (ValueError, TypeError) as error:
+        except (ValueError, TypeError, OverflowError) as error:
             raise CaptureError(f"{file}: {error}") from None
         self.frames = _index(times)
 
@@ -129,7 +129,7 @@ class DepthkitFolder:
             self.cameras: tuple[Camera, ...] = (camera_from_record(record | {"T_world_camera": pose}),)
         except KeyError as error:
             raise CaptureError(f"{file}: {error} is missing") from None
-        except (ValueError, TypeError) as error:
+        except (ValueError, TypeError, OverflowError) as error:
             raise CaptureError(f"{file}: {error}") from None
         self._folder = folder
         self.start_joints: NDArray[np.floating] | None = None
@@ -237,7 +237,7 @@ def _frame_rate(value: Any) -> float:
 
 def _camera_folder(path: Path, record: dict[str, Any]) -> _CameraFolder:
     camera = camera_from_record(record)
-    folder = _inside(path, record.get("folder", camera.name))
+    folder = inside(path, record.get("folder", camera.name))
     kind = next((kind for kind in ("depth", "mask", "color") if (folder / kind).is_dir()), None)
     if kind is None:
         raise CaptureError(f"{folder}: no folder depth/, mask/ or color/ of camera {camera.name}")
@@ -258,7 +258,7 @@ def _empty_room(path: Path, record: dict[str, Any], folder: _CameraFolder) -> ND
         if folder.kind == "color":
             raise ValueError(f"camera {folder.camera.name}: colour alone needs an empty_room, or silhouettes in mask/")
         return None
-    file = _inside(path, name)
+    file = inside(path, name)
     return read_depth(file, folder.camera) if folder.kind == "depth" else read_colour(file, folder.camera)[None]
 
 
@@ -282,7 +282,7 @@ def _index(times: Sequence[dict[int, int]]) -> tuple[tuple[int, int, int], ...]:
     return tuple((time - frames[0][0], camera, number) for time, camera, number in frames)
 
 
-def _inside(path: Path, name: Any) -> Path:
+def inside(path: Path, name: Any) -> Path:
     """A path below ``path``: a recording from elsewhere must not name files outside its folder."""
     file = path / str(name)
     if not file.resolve().is_relative_to(path.resolve()):

@@ -38,13 +38,16 @@ def open_skeleton_recording(path: Path) -> SkeletonRecording:
     """
     try:
         with path.open(newline="", encoding="utf-8") as file:
-            recording = read_multi_track(file) if path.suffix == ".csv" else _read_lines(file)
+            recording = read_multi_track(_bounded(file)) if path.suffix == ".csv" else _read_lines(file)
     except OSError as error:
         raise CaptureError(f"{path}: {error.strerror}") from None
     except (ValueError, csv.Error) as error:
         raise CaptureError(f"{path}: {error}") from None
     if not recording.instants:
         raise CaptureError(f"{path}: not a single skeleton")
+    times_ns = [skeleton.capture_ns for instant in recording.instants for skeleton in instant]
+    if max(times_ns) - min(times_ns) > _MAX_TIME_NS:
+        raise CaptureError(f"{path}: its times are too far apart")
     return _from_zero(recording)
 
 

@@ -23,11 +23,10 @@ from sender.fitting.clustered_kdtree import ClusterBins, ClusteredKdTree, build_
 from sender.fitting.global_fitting import GlobalFitting, LinkMoments, fit_globally, link_moments
 from sender.fitting.initial_pose import NoPose, find_initial_pose
 from sender.fitting.link_icp import IcpStop, partner_distances
-from sender.fitting.tracker import FitResult, Tracker
+from sender.fitting.tracker import MINIMUM_POINTS, FitResult, Tracker
 
 Array = NDArray[Any]
 
-MINIMUM_POINTS = 40
 SKIN_M2 = 1.9  # of an adult: how far apart the points of a cloud lie
 NEAR_M = 0.02  # a good fit is within this and the points' own spacing
 ENOUGH = 0.5  # of the points a link had in the initial cloud: with fewer it is sure of less

@@ -26,13 +26,12 @@ from sender.fitting.initial_pose_search import InitialPoseSearch
 from sender.fitting.joint_limits import joint_table, turned_on
 from sender.fitting.limb_search import CLEARLY_BETTER, Limb, limbs, thinned, within_reach
 from sender.fitting.particle_recovery import BodyRecovery, LimbRecovery
-from sender.fitting.tracker import FitResult
+from sender.fitting.tracker import MINIMUM_POINTS, FitResult
 from sender.fitting.whole_body_search import WholeBodySearch
 
 Array = NDArray[Any]
 
 FRAME_NS = 1e9 / 30.0
-MINIMUM_POINTS = 40
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,8 +111,7 @@ class GaussNewtonTracker:
     def track(self, cloud: PointCloud, capture_ns: int) -> FitResult | None:
         """The pose in ``cloud``; with too few points the last pose at confidence 0, or None before the start."""
         if len(cloud) < MINIMUM_POINTS:
-            self._status = f"{len(cloud)} points: nobody to see"
-            return self._unseen()
+            return self._nobody(len(cloud), capture_ns)
         self._frames += 1
         if self._state is None:
             return self._look(cloud, capture_ns)
@@ -126,6 +124,14 @@ class GaussNewtonTracker:
             self._status = "lost: looking for the person"
             return self._unseen()
         return self._accept(fit, cloud, capture_ns)
+
+    def _nobody(self, points: int, capture_ns: int) -> FitResult | None:
+        """Nobody to see; who comes after a while may be somebody else, and is looked at afresh."""
+        if capture_ns - self._good_ns > self._settings.lost_s * 1e9:
+            self._state = None
+        self._looking_since_ns = None
+        self._status = f"{points} points: nobody to see"
+        return self._unseen()
 
     def _look(self, cloud: PointCloud, capture_ns: int) -> FitResult | None:
         """The known person in any pose; when there is none, or they do not come, anybody upright."""

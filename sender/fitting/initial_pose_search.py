@@ -45,6 +45,7 @@ MEMORY_S = 1.0  # evidence fades: early frames may have had no fit near the trut
 INDEPENDENT_S = 0.1  # frames closer in time say the same thing
 MISGIVING = 25.0  # nor may the other side be this much cheaper on the last frame, whatever was seen before
 WALKED_COST_PER_M = 100.0
+GAP_S = 0.5  # after a longer one it may be somebody else, or the same person elsewhere
 STEADY_S, STEADY_M, STEADY_SHARE = 0.4, 0.06, 0.15  # an upper body neither grows nor rises: nobody is coming in
 
 
@@ -66,6 +67,8 @@ class InitialPoseSearch:
 
     def step(self, cloud: PointCloud, capture_ns: int) -> InitialPose | NoPose:
         """The start pose in ``cloud`` (N points, world, y up) of ``capture_ns``, or why there is none yet."""
+        if self._frame > 0 and not 0 <= capture_ns - self._times_ns[1] <= GAP_S * 1e9:
+            self._forget()
         points, normals = cloud.positions.astype(np.float64), cloud.normals.astype(np.float64)
         outline = outline_of(points, normals, self._floor_below(points))
         if isinstance(outline, NoPose):

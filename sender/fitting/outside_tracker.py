@@ -6,7 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from common.body.skeleton import NAMED_JOINT_LINKS
+from common.body.skeleton import LINK_COUNT, NAMED_JOINT_LINKS
+from common.body.skeleton_pose import SkeletonPose
 from sender.capture.outside_skeleton import Instant, Sensor
 from sender.fitting.outside_pose import OutsidePose
 from sender.fitting.outside_sizes import OutsideSizes
@@ -19,12 +20,16 @@ class OutsideTracker:
 
     def __init__(self, kind: str, sensors: Sequence[Sensor]) -> None:
         self._merger = SkeletonMerger(kind, sensors)
+        self._kind = kind
         self._sizes = OutsideSizes(kind)
+        self._people = self._merger.people
+        self._last: FitResult | None = None
         self._pose = OutsidePose(kind)
         self.status = "waiting for the sensors' skeletons"
 
     def track(self, instant: Instant) -> FitResult | None:
-        """The person at an instant, from the skeletons of one sensor or more; None before a whole trunk was seen.
+        """The person at an instant, from the skeletons of one sensor or more; None before a whole trunk was seen,
+        and while it is not, the last pose at confidence 0.
 
         ``inliers``: share of the joints that a sensor tracks; ``rms_m``: between the joints and the sensors' word.
 
@@ -35,11 +40,13 @@ class OutsideTracker:
         self.status = f"merging sensors' skeletons: {len(instant)} of them"
         if not np.isfinite(merged.joints[self._pose.trunk_rows]).all():
             self.status = "the sensors do not see a whole trunk"
-            return None
+            return None if self._last is None else _untrusted(self._last)
+        if self._merger.people != self._people:  # another person's sizes are learned from nothing
+            self._sizes, self._people = OutsideSizes(self._kind), self._merger.people
         tracked = merged.confidence > SEEN
         skeleton = self._sizes.update(np.where(tracked[:, None], merged.joints, np.nan))
         pose = self._pose.fit(skeleton, merged.joints, merged.confidence)
-        return FitResult(
+        self._last = FitResult(
             skeleton=skeleton,
             pose=pose,
             converged=bool(tracked.any()),
@@ -48,3 +55,9 @@ class OutsideTracker:
             rms_m=merged.spread_m,
             confidence=float(pose.confidence[NAMED_JOINT_LINKS].mean()),
         )
+        return self._last
+
+
+def _untrusted(last: FitResult) -> FitResult:
+    pose = SkeletonPose(last.pose.root_position, last.pose.rotations, np.zeros(LINK_COUNT, np.float32))
+    return FitResult(last.skeleton, pose, False, 0, 0.0, 0.0, 0.0)

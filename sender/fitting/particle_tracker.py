@@ -26,7 +26,7 @@ from sender.fitting.initial_pose_search import InitialPoseSearch
 from sender.fitting.joint_limits import joint_table, turned_on
 from sender.fitting.limb_search import thinned
 from sender.fitting.particle_weights import ParticleWeights, numba_weights
-from sender.fitting.tracker import FitResult
+from sender.fitting.tracker import MINIMUM_POINTS, FitResult
 from sender.fitting.whole_body_ellipsoids import Ellipsoids, whole_body_ellipsoids
 from sender.fitting.whole_body_fit import EllipsoidFit, fit_ellipsoids, judge_ellipsoids
 from sender.fitting.whole_body_particles import EXPECTED, WholeBodyParticles
@@ -34,7 +34,6 @@ from sender.fitting.whole_body_particles import EXPECTED, WholeBodyParticles
 Array = NDArray[Any]
 
 FRAME_NS = 1e9 / 30.0
-MINIMUM_POINTS = 40
 SEARCH_POINTS, FIT_POINTS = 600, 1250
 HYPOTHESES = (1.0, 0.0)  # shares of the last velocity
 COARSE = Schedule(3, 0.20, 0.10, 0.0, 1.0, 1.0)
@@ -116,6 +115,9 @@ class ParticleTracker:
         """The pose in ``cloud``; with too few points the last pose at confidence 0, or None before the start."""
         if len(cloud) < MINIMUM_POINTS:
             self._status = f"{len(cloud)} points: nobody to see"
+            self._looking_since_ns = None
+            if self._skeleton is not None and capture_ns - self._good_ns > self._settings.lost_s * 1e9:
+                self._skeleton = None  # who comes next may be somebody else
             return self._unseen()
         if self._skeleton is None:
             return self._look(cloud, capture_ns)

@@ -66,7 +66,7 @@ def _keep_lengths(joints, share, bones, lengths, rounds):  # type: ignore[no-unt
             i, j = bones[b, 0], bones[b, 1]
             x, y, z = joints[j, 0] - joints[i, 0], joints[j, 1] - joints[i, 1], joints[j, 2] - joints[i, 2]
             length = np.sqrt(x * x + y * y + z * z)
-            if length < 1e-9 or not lengths[b] > 0.0:
+            if not length > 1e-9 or not lengths[b] > 0.0:  # an end that nobody has seen is NaN
                 continue
             excess = (length - lengths[b]) / (length * (share[i] + share[j]))
             worst = max(worst, abs(length - lengths[b]))
@@ -133,6 +133,7 @@ class SkeletonMerger:
         self.bones = bones_of(kind)
         self.lengths = np.full(len(self.bones), np.nan)
         self._learned = RunningMedian(len(self.bones))
+        self.people = 1  # so far, told apart by their sizes
         self._stranger: RunningMedian | None = None  # sizes of somebody who came after an absence
         self._positions = np.array([sensor.position for sensor in sensors], np.float64).reshape(-1, 3)
         self._sides = tuple([names.index(f"{s}_{joint}") for joint in ("shoulder", "hip")] for s in ("left", "right"))
@@ -271,6 +272,7 @@ class SkeletonMerger:
             return
         if np.nanmedian(np.abs(theirs - self.lengths) / self.lengths) > ANOTHER_PERSON:
             self._learned, self.lengths = self._stranger, theirs
+            self.people += 1
         self._stranger = None
 
     def _hold_on(self, words: _Words, joints: Floats, passed_s: float) -> None:
@@ -282,7 +284,8 @@ class SkeletonMerger:
         pull = np.where(total > 0, min(passed_s / PULL_S, 1.0) * (mean - joints), 0.0)
         for witness, own, stale in zip(words.witnesses, words.places, words.staleness, strict=True):
             gain = _drift_gain(DRIFT_M2_S * passed_s, witness.noise + stale)
-            witness.bias += gain[:, None] * (own - joints - witness.bias) - pull
+            change = gain[:, None] * (own - joints - witness.bias) - pull
+            witness.bias += np.where(np.isfinite(change), change, 0.0)  # nothing is learned where nobody sees
 
     def _move_on(self, joints: Floats, unseen: NDArray[np.bool_], capture_ns: int, passed_s: float) -> None:
         if passed_s > 0:
@@ -307,5 +310,6 @@ def _mean(said: Floats, variance: Floats, led: Floats, passed_s: float) -> Float
     weight = 1 / variance
     past = np.where(np.isfinite(led[:, 0]), 1 / (PAST_M + 0.5 * ACCELERATION_M_S2 * passed_s**2) ** 2, 0.0)
     total = weight.sum(axis=0) + past
-    places = (weight[..., None] * said).sum(axis=0) + past[:, None] * np.nan_to_num(led)
+    heard = np.where(weight[..., None] > 0, said, 0.0)  # who does not see a joint may say NaN
+    places = (weight[..., None] * heard).sum(axis=0) + past[:, None] * np.nan_to_num(led)
     return np.where(total[:, None] > 0, places / np.maximum(total, _TINY)[:, None], np.nan)

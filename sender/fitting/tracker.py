@@ -10,6 +10,8 @@ from common.body.skeleton_pose import SkeletonPose
 from common.geometry.point_cloud import PointCloud
 from sender.fitting.body_model import BodyModel
 
+MINIMUM_POINTS = 40  # fewer are nobody
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FitResult:

@@ -114,6 +114,7 @@ def realness(positions: Floats, volumes: NDArray[np.int32], cameras: Sequence[Ca
         there = (local[:, 2] > 0) & (pixels >= 0).all(axis=1) & (pixels < (camera.width, camera.height)).all(axis=1)
         column, row = (pixels[there] * (BLOCKS_ACROSS / camera.width)).astype(np.int64).T
         covered = np.zeros((count, int(row.max(initial=0)) + 1, BLOCKS_ACROSS), np.bool_)
+        column = np.minimum(column, BLOCKS_ACROSS - 1)  # rounding
         covered[volumes[kept][there], row, column] = True
         own = covered & (covered.sum(axis=0) == 1)
         area = covered.sum(axis=(1, 2))

@@ -197,7 +197,7 @@ def _longer(line, depths, made_by, capacity):  # type: ignore[no-untyped-def]
 
 @njit(nogil=True, cache=True, error_model="numpy", inline="always")
 def _within(camera, epipolar, lenses, edges, low, high):  # type: ignore[no-untyped-def]
-    """The part of the depths low..high whose image lies lies within ``edges``: five half-spaces a + z·b >= 0."""
+    """The part of the depths low..high whose image lies within ``edges``: five half-spaces a + z·b >= 0."""
     z, zz = epipolar[camera, 2], epipolar[camera, 5]
     for side in range(5):
         if side == 4:
