@@ -7,18 +7,25 @@ import numpy as np
 from common.body.mannequin import mannequin, mannequin_camera, mannequin_depth
 from common.body.skeleton_pose import forward_kinematics, joint_positions, named_joint_positions
 from common.body.view import View
+from common.geometry import quaternion
 from common.geometry.camera_model import Camera
+from common.geometry.point_cloud import PointCloud
 from common.runtime.clock import MonotonicClock
 from common.runtime.stage_timer import StageTimer
 from sender.capture.frame_set import ColourFrame, DepthFrame, FrameSet
 from sender.capture.outside_skeleton import OutsideSkeleton, Sensor
 from sender.capture.rig_layout import cameras_around
 from sender.config import CandidateSettings
+from sender.fitting.articulated_gauss_newton import PoseState
+from sender.fitting.body_fitter import BodyFitter
 from sender.fitting.body_model import BodyModel
 from sender.fitting.gauss_newton_tracker import GaussNewtonSettings, GaussNewtonTracker
 from sender.fitting.initial_pose_search import InitialPoseSearch
+from sender.fitting.joint_limits import joint_table
+from sender.fitting.limb_search import limbs, search_limb
 from sender.fitting.outside_joints import sensor_joints
 from sender.fitting.outside_tracker import OutsideTracker
+from sender.fitting.particle_recovery import BodyRecovery, LimbRecovery
 from sender.fitting.particle_tracker import ParticleSettings, ParticleTracker
 from sender.fitting.tracker import FitResult
 from sender.pipeline import CandidatePath, SkeletonPath, StreamIdentity, TrackedFrame
@@ -68,6 +75,26 @@ def rehearse_restart() -> None:
         tracker.track(cloud, index * FRAME_NS)
 
 
+def rehearse_recovery() -> None:
+    """Look for a limb and for a whole body that got lost, on noisy points: in a session it comes when it comes, and a
+    kernel compiled then would hold up the picture for seconds."""
+    skeleton, pose = mannequin()
+    cloud = PointSampler([mannequin_camera()]).points([_view(mannequin_camera())])
+    T_world_link, random = forward_kinematics(skeleton, pose), np.random.default_rng(0)
+    body = BodyModel(skeleton)
+    for _ in range(4):  # a thick shell, which the model thins
+        noise = random.normal(0, 0.03, cloud.positions.shape).astype(np.float32)
+        body.add(PointCloud(cloud.positions + noise, cloud.normals, cloud.colours), T_world_link)
+    fitter = BodyFitter(body, joint_table())
+    local = quaternion.to_matrix(pose.rotations.astype(np.float64))
+    state = PoseState(pose.root_position.astype(np.float64), local)
+    fit = fitter.judge(cloud, state)._replace(owner=np.full(len(cloud), -1))  # nobody explains a point
+    for limb in limbs(fitter.table):
+        search_limb(limb, fit, cloud, fitter, (state,))
+        LimbRecovery(limb, state, 0).step(fit, cloud, fitter)
+    BodyRecovery(state, 0).step(state, cloud, fitter)
+
+
 def rehearse_particles() -> None:
     """Follow a mannequin for a few frames with ellipsoids and particles."""
     skeleton, pose = mannequin()
@@ -103,6 +130,7 @@ def rehearse_skeletons() -> None:
 def rehearse_all() -> None:
     """What a sender does from the first frame on."""
     rehearse_fitting()
+    rehearse_recovery()
     rehearse_skeletons()
     rehearse_hull()
     rehearse_candidates()

@@ -9,7 +9,9 @@ from common.body.skeleton_pose import joint_positions
 from common.geometry.camera_model import project
 from receiver import rehearsal as receiving
 from sender import rehearsal as sending
+from sender.fitting.body_model import _sheet
 from sender.fitting.gauss_newton_tracker import GaussNewtonTracker
+from sender.fitting.limb_search import score_poses
 from sender.pipeline import CandidatePath
 
 
@@ -64,3 +66,10 @@ def test_the_receivers_rehearsal_shows_a_mesh(monkeypatch):
     monkeypatch.setattr(receiving.AnimationPath, "show", watched)
     receiving.rehearse()
     assert all(result.frame is not None and result.frame.pose_id == 1 for result in shown)
+
+
+def test_what_a_session_meets_late_is_rehearsed_too():
+    """Kernels that only a lost limb or a noisy surface needs are compiled before the first frame."""
+    sending.rehearse_recovery()
+    assert score_poses.signatures
+    assert _sheet.signatures
