@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import argparse
 import sys
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -22,24 +24,46 @@ SEEN_AFTER = 3  # frames: 100 ms
 CASES = (("male_avg", "14_06"), ("male_avg", "02_10"))
 
 
-def run(data: Path | None, seconds: float | None, clips: tuple[str, ...]) -> list[Row]:
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """This bench's own options."""
+    parser.add_argument("--methods", default=",".join(METHODS), help=f"of {', '.join(METHODS)}, separated by commas")
+    parser.add_argument(
+        "--bandwidths", default=",".join(f"{bps / 1e6:g}" for bps in BANDWIDTHS_BPS), help="Mbit/s, separated by commas"
+    )
+    parser.add_argument("--skeletons", default="true,own", help="true, own (our tracker's), or both")
+    parser.add_argument("--captures", type=Path, help="folder where captured motions are kept for the next time")
+
+
+def run(
+    data: Path | None, seconds: float | None, clips: tuple[str, ...], methods: str, bandwidths: str, skeletons: str,
+    captures: Path | None = None,
+) -> Iterator[Row]:  # fmt: skip
     """Rows for every body, motion, bandwidth, method and skeleton. ``seconds``: length of a session."""
-    rows: list[Row] = []
+    chosen = _chosen(methods, tuple(METHODS))
+    owns = [word == "own" for word in _chosen(skeletons, ("true", "own"))]
+    rates_bps = [float(word) * 1e6 for word in bandwidths.split(",")]
     for body, motion in _cases(data, clips):
         case = f"{body}/{motion or 'routine'}/4"
-        recorded = capture(body, motion, data, 4, CAPTURED_S, show_progress(f"capturing {case}"))
-        for bandwidth_bps in BANDWIDTHS_BPS:
-            for name in METHODS:
-                for own in (False, True):
-                    begun = time.monotonic()
-                    method = METHODS[name](bandwidth_bps, own)
-                    figures = measured(method, recorded, seconds or SESSION_S)
+        recorded = capture(body, motion, data, 4, CAPTURED_S, show_progress(f"capturing {case}"), captures)
+        for bandwidth_bps in rates_bps:
+            for name in chosen:
+                for own in owns:
                     label = f"{case}/{bandwidth_bps / 1e6:g}M/{name}-{'own' if own else 'true'}"
-                    rows += [Row(case=label, metric=metric, value=value, unit=unit, reference=None, source="")
-                             for metric, (value, unit) in figures.items()]  # fmt: skip
+                    begun = time.monotonic()
+                    figures = measured(METHODS[name](bandwidth_bps, own), recorded, seconds or SESSION_S)
+                    yield from (Row(case=label, metric=metric, value=value, unit=unit, reference=None, source="")
+                                for metric, (value, unit) in figures.items())  # fmt: skip
                     told = "  ".join(f"{m} {v:.2f}" for m, (v, _) in figures.items())
                     print(f"\r{label}: {told}  ({time.monotonic() - begun:.0f} s)", file=sys.stderr, flush=True)
-    return rows
+
+
+def _chosen(words: str, known: tuple[str, ...]) -> list[str]:
+    """The words of an option, in the order given; unknown ones end the bench."""
+    chosen = [word for word in words.split(",") if word]
+    for word in chosen:
+        if word not in known:
+            raise SystemExit(f"{word}: unknown, there are {', '.join(known)}")
+    return chosen
 
 
 def measured(method: Method, recorded: Capture, seconds: float) -> dict[str, tuple[float, str]]:

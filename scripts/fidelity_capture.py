@@ -8,15 +8,13 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from common.body.skeleton import Skeleton
-from common.body.skeleton_pose import SkeletonPose
 from common.body.view import View
 from common.geometry.rasterizer import render
+from scripts.capture_files import CapturedFrame, load_frames, save_frames
 from scripts.fidelity import Picture, measuring_cameras
 from scripts.true_skeleton import TrueSkeleton
 from sender.capture.frame_set import DepthFrame
@@ -31,17 +29,6 @@ FRAME_RATE_HZ = 30
 FRAME_NS = round(1e9 / FRAME_RATE_HZ)
 START_S = 2.0  # start pose and blend
 POINTS = 2500
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class CapturedFrame:
-    """One instant. ``time_s`` of the performance; ``views`` of the cameras that see the person; skeleton, pose and
-    confidence from the truth and from our tracker (``own`` is None before its start)."""
-
-    time_s: float
-    views: tuple[View, ...]
-    true: tuple[Skeleton, SkeletonPose]
-    own: tuple[Skeleton, SkeletonPose, float] | None
 
 
 class Capture:
@@ -80,15 +67,30 @@ def capture(
     cameras: int,
     seconds: float,
     progress: Callable[[float], None] | None = None,
+    kept: Path | None = None,
 ) -> Capture:
-    """Render, cut out and track ``seconds`` of a performance (at most until it repeats).
+    """Render, cut out and track ``seconds`` of a performance (at most until it repeats), or load what was ``kept`` in a
+    folder of that name when it was captured last.
 
     Raises:
         CaptureError: no such body or motion.
     """
     performer = open_performer(body, motion, data)
-    truth = TrueSkeleton(performer)
     renderer = RigRenderer(performer, RigSettings(cameras=cameras))
+    folder = None if kept is None else kept / f"{body}-{motion or 'routine'}-{cameras}-{seconds:g}s"
+    frames = None if folder is None else load_frames(folder, renderer.cameras)
+    if frames is None:
+        count = int(min(seconds, performer.duration_s + START_S) * FRAME_RATE_HZ)
+        frames = _captured(performer, renderer, count, progress or (lambda _: None))
+        if folder is not None:
+            save_frames(folder, frames, renderer.cameras)
+    return Capture(performer, frames)
+
+
+def _captured(
+    performer: Performer, renderer: RigRenderer, count: int, progress: Callable[[float], None]
+) -> list[CapturedFrame]:
+    truth = TrueSkeleton(performer)
     rooms = [
         BackgroundModel(camera, renderer.empty_room(index), BackgroundSettings())
         for index, camera in enumerate(renderer.cameras)
@@ -96,7 +98,6 @@ def capture(
     sampler = PointSampler(renderer.cameras, POINTS)
     tracker = open_tracker("gauss-newton")
     frames = []
-    count = int(min(seconds, performer.duration_s + START_S) * FRAME_RATE_HZ)
     for k in range(count):
         time_s = k / FRAME_RATE_HZ
         views = []
@@ -110,9 +111,9 @@ def capture(
         fit = tracker.track(sampler.points(views), k * FRAME_NS)
         own = None if fit is None else (fit.skeleton, fit.pose, fit.confidence)
         frames.append(CapturedFrame(time_s, tuple(views), (truth.skeleton, truth.pose(time_s)), own))
-        if k % FRAME_RATE_HZ == 0 and progress is not None:
+        if k % FRAME_RATE_HZ == 0:
             progress(k / count)
-    return Capture(performer, frames)
+    return frames
 
 
 def show_progress(what: str) -> Callable[[float], None]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable
 from typing import Protocol
 
@@ -19,8 +20,9 @@ from common.wire.candidate_pose import CandidatePose, encode_candidate_pose
 from common.wire.skeleton_packet import SkeletonPacket
 from receiver.config import RepositorySettings
 from receiver.pipeline import AnimationPath, ReceivedPose, SkeletonToShow, mesh_of
+from scripts.capture_files import CapturedFrame
 from scripts.fidelity import Picture
-from scripts.fidelity_capture import FRAME_NS, FRAME_RATE_HZ, CapturedFrame
+from scripts.fidelity_capture import FRAME_NS, FRAME_RATE_HZ
 from scripts.fidelity_link import ByteLink
 from sender.candidate_poses.mesh_scheduler import MeshScheduler
 from sender.candidate_poses.usable_pose_set import UsablePoseSet
@@ -140,8 +142,6 @@ class Dispose(_Animated):
             self._arrived.append(mesh_of(message, 0))
 
     def _animate(self, k: int, fitted: tuple[Skeleton, SkeletonPose, float]) -> None:
-        from collections import deque
-
         skeleton, pose, confidence = fitted
         packet = SkeletonPacket(0, 1, k, k * FRAME_NS, 1, confidence, pose, None)
         shown = self._animation.show(SkeletonToShow(packet, skeleton, deque(self._arrived)))
