@@ -6,24 +6,30 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
+from common.body.body_regions import DEFAULT_WEIGHTS, region_weights
+from common.body.rigged_mesh import ScoreForm
 from common.runtime.metrics import MetricsSettings
 from common.transport.zenoh_session import LinkSettings
 
 
 @dataclass(frozen=True, slots=True)
 class RepositorySettings:
-    """The candidate poses kept (DISPOSE §6.2). ``poses``, ``megabytes``: bounds; the least used leaves first."""
+    """The candidate poses kept (DISPOSE §6.2). ``poses``, ``megabytes``: bounds; the least used leaves first.
+    ``region_weights``: ω where it is not the default; ``score_form``: what σ divides by."""
 
     poses: int = 60
     megabytes: int = 512
     search: Literal["threshold", "exhaustive"] = "threshold"
     hold: bool = True
+    region_weights: dict[str, float] = field(default_factory=lambda: dict(DEFAULT_WEIGHTS))
+    score_form: ScoreForm = "joining-edges"
 
     def __post_init__(self) -> None:
         if not 1 <= self.poses <= 1000:
             raise ValueError(f"poses: {self.poses} is outside 1..1000")
         if not 16 <= self.megabytes <= 65_536:
             raise ValueError(f"megabytes: {self.megabytes} is outside 16..65536")
+        region_weights(self.region_weights)
 
 
 @dataclass(frozen=True, slots=True)

@@ -160,7 +160,10 @@ class _Show:
             message = await self._messages.get()
             try:
                 with self._timer.stage("mesh"):
-                    mesh = await loop.run_in_executor(self._mesher, mesh_of, message, self._settings.person)
+                    settings = self._settings
+                    mesh = await loop.run_in_executor(
+                        self._mesher, mesh_of, message, settings.person, settings.repository.score_form
+                    )
             except WireError as error:
                 self._counts["pose refused"] += 1
                 log.warning("a candidate pose is refused: %s", error)

@@ -12,7 +12,8 @@ from statistics import median
 import numpy as np
 from numpy.typing import NDArray
 
-from common.body.rigged_mesh import RiggedMesh, build_rigged_mesh
+from common.body.body_regions import region_weights
+from common.body.rigged_mesh import RiggedMesh, ScoreForm, build_rigged_mesh
 from common.body.skeleton import Skeleton
 from common.body.skeleton_pose import forward_kinematics
 from common.body.skinning import link_motion
@@ -59,8 +60,10 @@ class Shown:
     counts: Counter[str]
 
 
-def mesh_of(message: bytes, person: int) -> ReceivedPose:
+def mesh_of(message: bytes, person: int, score_form: ScoreForm = "joining-edges") -> ReceivedPose:
     """Decode a candidate pose and build its rigged mesh (depth → triangles → links), as the sender did.
+
+    ``score_form``: of the distortion score here.
 
     Raises:
         WireError: it cannot be decoded, is another person's, or holds no surface.
@@ -70,7 +73,12 @@ def mesh_of(message: bytes, person: int) -> ReceivedPose:
         raise WireError(f"candidate pose of person {candidate.person}, expected {person}")
     try:
         mesh = build_rigged_mesh(
-            candidate.pose_id, candidate.capture_ns, candidate.skeleton, candidate.pose, candidate.views
+            candidate.pose_id,
+            candidate.capture_ns,
+            candidate.skeleton,
+            candidate.pose,
+            candidate.views,
+            score_form=score_form,
         )
     except ValueError as error:
         raise WireError(str(error)) from error
@@ -81,10 +89,10 @@ class AnimationPath:
     """Every skeleton: repository → pose selection by σ → animation. One thread's own."""
 
     def __init__(self, settings: Settings, timer: StageTimer, clock: Clock) -> None:
-        self._repository = PoseRepository(
-            RepositorySettings(max_poses=settings.poses, max_bytes=settings.megabytes << 20)
-        )
-        self._selector = PoseSelector(SelectionSettings(search=settings.search, hold=settings.hold))
+        weights = region_weights(settings.region_weights)
+        bounds = RepositorySettings(max_poses=settings.poses, max_bytes=settings.megabytes << 20)
+        self._repository = PoseRepository(bounds, weights)
+        self._selector = PoseSelector(SelectionSettings(search=settings.search, hold=settings.hold), weights)
         self._timer = timer
         self._clock = clock
         self._on_screen: int | None = None

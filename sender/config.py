@@ -6,6 +6,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
+from common.body.body_regions import DEFAULT_WEIGHTS, region_weights
+from common.body.rigged_mesh import ScoreForm
 from common.runtime.metrics import MetricsSettings
 from common.transport.zenoh_session import LinkSettings
 
@@ -64,13 +66,16 @@ class TrackingSettings:
 @dataclass(frozen=True, slots=True)
 class CandidateSettings:
     """Candidate poses. ``interval_ms``: time between two that are considered. ``least_confidence``: of a fit, for its
-    frame to become one. ``jpeg_quality``, ``depth_step_mm``: how finely a view is sent."""
+    frame to become one. ``jpeg_quality``, ``depth_step_mm``: how finely a view is sent. ``region_weights``: ω where it
+    is not the default; ``score_form``: what σ divides by."""
 
     enabled: bool = True
     interval_ms: float = 200.0
     least_confidence: float = 0.5
     jpeg_quality: int = 85
     depth_step_mm: int = 2
+    region_weights: dict[str, float] = field(default_factory=lambda: dict(DEFAULT_WEIGHTS))
+    score_form: ScoreForm = "joining-edges"
 
     def __post_init__(self) -> None:
         if not 0 <= self.interval_ms <= 60_000:
@@ -81,6 +86,7 @@ class CandidateSettings:
             raise ValueError(f"jpeg_quality: {self.jpeg_quality} is outside 30..100")
         if not 1 <= self.depth_step_mm <= 16:
             raise ValueError(f"depth_step_mm: {self.depth_step_mm} is outside 1..16")
+        region_weights(self.region_weights)
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from common.body.body_regions import region_weights
 from common.body.rigged_mesh import build_rigged_mesh
 from common.body.skeleton import Skeleton
 from common.body.skeleton_pose import SkeletonPose, forward_kinematics
@@ -172,7 +173,7 @@ class CandidatePath:
         self._identity = identity
         self._settings = settings
         self._timer = timer
-        self._usable = UsablePoseSet()
+        self._usable = UsablePoseSet(region_weights=region_weights(settings.region_weights))
         self._poses = 0
         self._skeletons: deque[tuple[int, NDArray[np.float32]]] = deque(maxlen=UsablePoseSettings().max_skeletons)
         self._sent: deque[tuple[int, float]] = deque(maxlen=UsablePoseSettings().max_poses)
@@ -203,7 +204,12 @@ class CandidatePath:
         with self._timer.stage("candidate mesh"):
             candidate = decode_candidate_pose(encoded)
             mesh = build_rigged_mesh(
-                candidate.pose_id, candidate.capture_ns, candidate.skeleton, candidate.pose, candidate.views
+                candidate.pose_id,
+                candidate.capture_ns,
+                candidate.skeleton,
+                candidate.pose,
+                candidate.views,
+                score_form=self._settings.score_form,
             )
         with self._timer.stage("usable poses"):
             while self._sent:

@@ -7,6 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from common.body.body_regions import vertex_regions
 from common.body.rigged_mesh import RiggedMesh, joint_edges
 from common.body.skeleton import LINK_COUNT, LINK_INDEX, Skeleton, human_skeleton
 from common.body.skeleton_pose import SkeletonPose, bone_segments, forward_kinematics, joint_positions, rest_pose
@@ -56,7 +57,7 @@ def capsule_person(pose_id: int = 0, pose: SkeletonPose | None = None) -> Rigged
     )
     vertex_link = np.repeat(np.arange(LINK_COUNT, dtype=np.uint8), per_link)
     T_link_world = inverse(T_world_link.astype(np.float64))
-    edges = joint_edges(mesh, vertex_link, T_link_world)
+    edges = joint_edges(mesh, vertex_regions(mesh.vertices, vertex_link, SKELETON, T_link_world), T_link_world)
     blend = vertex_blend(mesh.vertices, vertex_link, SKELETON, T_world_link)
     return RiggedMesh(pose_id, 0, SKELETON, pose, T_link_world, mesh, vertex_link, blend, mesh.faces, edges)
 

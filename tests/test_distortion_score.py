@@ -7,25 +7,37 @@ import dataclasses
 import numpy as np
 import pytest
 
+from common.body.body_regions import (
+    REGION_COUNT,
+    REGION_INDEX,
+    REGION_LINKS,
+    REGION_NAMES,
+    default_region_weights,
+    vertex_regions,
+)
 from common.body.distortion_score import (
     START_THRESHOLD,
     SessionThreshold,
-    default_region_weights,
     distortion_score,
     distortion_scores,
+    region_scores,
 )
 from common.body.rigged_mesh import RiggedMesh, joint_edges
-from common.body.skeleton import LINK_COUNT, LINK_INDEX
 from common.body.skeleton_pose import SkeletonPose
 from common.body.skinning import animate, link_motion
+from tests.capsule_person import SKELETON
 from tests.capsule_views import arms_down_by, captured, links_of
 
 WEIGHTS = default_region_weights()
-EQUAL = np.ones(LINK_COUNT, np.float32)
+EQUAL = np.ones(REGION_COUNT, np.float32)
 
 
-def by_the_book(mesh: RiggedMesh, pose: SkeletonPose, weights: np.ndarray) -> float:
-    """Animate everything, take every edge of every triangle, Eq. (1) per region, Eq. (2)."""
+def regions_of(mesh: RiggedMesh) -> np.ndarray:
+    return vertex_regions(mesh.mesh.vertices, mesh.vertex_link, SKELETON, mesh.T_link_world)
+
+
+def by_the_book(mesh: RiggedMesh, pose: SkeletonPose) -> np.ndarray:
+    """Animate everything, take every edge of every triangle, Eq. (1) per region; NaN for regions without edges."""
     before, after = mesh.mesh.vertices, animate(mesh, link_motion(mesh, links_of(pose)), "rigid")
     pairs = {
         (min(a, b), max(a, b))
@@ -35,22 +47,44 @@ def by_the_book(mesh: RiggedMesh, pose: SkeletonPose, weights: np.ndarray) -> fl
     ends = np.array(sorted(pairs))
     length = np.linalg.norm(before[ends[:, 0]] - before[ends[:, 1]], axis=1)
     change = np.abs(np.linalg.norm(after[ends[:, 0]] - after[ends[:, 1]], axis=1) - length)
-    links = mesh.vertex_link[ends]
-    scores = []
-    for region in range(LINK_COUNT):
-        deformable = (links == region).any(axis=1) & (links[:, 0] != links[:, 1])
+    regions = regions_of(mesh)[ends]
+    scores = np.full(REGION_COUNT, np.nan)
+    for region in range(REGION_COUNT):
+        links = REGION_LINKS[regions]
+        deformable = (regions == region).any(axis=1) & (links[:, 0] != links[:, 1])
         if deformable.any():
-            scores.append(weights[region] * change[deformable].sum() / length[deformable].sum())
-    return float(np.mean(scores))
+            scores[region] = change[deformable].sum() / length[deformable].sum()
+    return scores
 
 
 @pytest.mark.parametrize("weights", [EQUAL, WEIGHTS], ids=["equal", "default"])
 @pytest.mark.parametrize("angle_rad", [0.2, 1.3])
 def test_it_is_the_papers_equation(angle_rad: float, weights: np.ndarray) -> None:
     mesh, target = captured(0.8), arms_down_by(angle_rad, turned_rad=0.4)
-    expected = by_the_book(mesh, target, weights)
+    expected = np.nanmean(weights * by_the_book(mesh, target))
     assert expected > 0.01
     assert distortion_score(mesh, links_of(target), weights) == pytest.approx(expected, rel=2e-3)
+
+
+def test_each_regions_score_is_told_by_name() -> None:
+    mesh, target = captured(0.8), arms_down_by(0.2)
+    scores, expected = region_scores(mesh, links_of(target)), by_the_book(mesh, target)
+    assert scores.shape == (len(REGION_NAMES),)
+    np.testing.assert_allclose(scores, expected, rtol=2e-3, atol=1e-4)
+    moved = [REGION_INDEX["left_clavicle"], REGION_INDEX["right_upper_arm"]]
+    assert scores[moved].min() > 10 * scores[REGION_INDEX["left_shin"]]
+    assert np.nanmean(WEIGHTS * scores) == pytest.approx(distortion_score(mesh, links_of(target), WEIGHTS), rel=1e-4)
+
+
+def test_a_region_nobody_saw_has_no_score() -> None:
+    mesh = captured(0.8)
+    seen = regions_of(mesh)
+    kept = ~(seen[mesh.mesh.faces] == REGION_INDEX["head"]).any(axis=1)
+    beheaded = dataclasses.replace(mesh.mesh, faces=mesh.mesh.faces[kept])
+    scrap = dataclasses.replace(mesh, joint_edges=joint_edges(beheaded, seen, mesh.T_link_world))
+    scores = region_scores(scrap, links_of(arms_down_by(0.2)))
+    assert np.isnan(scores[REGION_INDEX["head"]])
+    assert np.isfinite(scores[REGION_INDEX["left_forearm"]])
 
 
 def test_its_own_skeleton_costs_nothing() -> None:
@@ -87,14 +121,13 @@ def test_a_batch_scores_like_one_by_one() -> None:
 def test_a_regions_weight_counts() -> None:
     target = links_of(arms_down_by(1.3))
     without = EQUAL.copy()
-    without[[LINK_INDEX["left_upper_arm"], LINK_INDEX["right_upper_arm"]]] = 0
+    without[[REGION_INDEX["left_upper_arm"], REGION_INDEX["right_upper_arm"]]] = 0
     assert distortion_score(captured(0.4), target, without) < 0.9 * distortion_score(captured(0.4), target, EQUAL)
-    assert WEIGHTS[LINK_INDEX["left_fingers"]] < WEIGHTS[LINK_INDEX["left_hand"]] < WEIGHTS[LINK_INDEX["head"]]
 
 
 def test_a_mesh_without_joint_edges_cannot_be_judged() -> None:
     mesh = captured(0.8)
-    one_link = np.zeros_like(mesh.vertex_link)
+    one_link = np.zeros_like(mesh.vertex_link)  # region 0 is link 0
     scrap = dataclasses.replace(
         mesh, vertex_link=one_link, joint_edges=joint_edges(mesh.mesh, one_link, mesh.T_link_world)
     )

@@ -5,8 +5,16 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from common.body.body_regions import REGION_INDEX, REGION_LINKS, vertex_regions
 from common.body.depth_mesher import mesh_view
-from common.body.rigged_mesh import DRAWN_EDGE_M, DRAWN_LINK_STEPS, MESH_STRIDE, build_rigged_mesh
+from common.body.rigged_mesh import (
+    DRAWN_EDGE_M,
+    DRAWN_LINK_STEPS,
+    FIXED_EDGE_M,
+    MESH_STRIDE,
+    build_rigged_mesh,
+    joint_edges,
+)
 from common.body.skeleton import LINK_COUNT, LINK_INDEX, LINK_PARENTS
 from common.body.skinning import animate, link_motion
 from common.body.view import View
@@ -16,6 +24,7 @@ from tests.capsule_views import arms_down_by, capsule_views, captured, links_of,
 
 ANGLE_RAD = 1.35  # hands at the thighs
 MESH = captured(ANGLE_RAD, pose_id=7, capture_ns=123)
+REGIONS = vertex_regions(MESH.mesh.vertices, MESH.vertex_link, SKELETON, MESH.T_link_world)
 
 
 def all_edges() -> set[tuple[int, int]]:
@@ -61,13 +70,13 @@ def test_joint_edges_are_the_edges_between_links_each_once() -> None:
     assert set(found) == expected
 
 
-def test_joint_edges_are_grouped_by_link_pair() -> None:
+def test_joint_edges_are_grouped_by_region_pair() -> None:
     edges = MESH.joint_edges
-    links = MESH.vertex_link[edges.vertices]
-    of_pair = np.repeat(edges.pair_links, np.diff(edges.pair_starts), axis=0)
-    np.testing.assert_array_equal(links, of_pair)
-    assert len(np.unique(edges.pair_links, axis=0)) == len(edges.pair_links)
-    assert (edges.pair_links[:, 0] < edges.pair_links[:, 1]).all()
+    counts = np.diff(edges.pair_starts)
+    np.testing.assert_array_equal(MESH.vertex_link[edges.vertices], np.repeat(edges.pair_links, counts, axis=0))
+    np.testing.assert_array_equal(REGIONS[edges.vertices], np.repeat(edges.pair_regions, counts, axis=0))
+    assert len(np.unique(edges.pair_regions, axis=0)) == len(edges.pair_regions)
+    assert (edges.pair_regions[:, 0] < edges.pair_regions[:, 1]).all()
 
 
 def test_joint_edges_hold_their_ends_in_link_frames() -> None:
@@ -84,9 +93,21 @@ def test_joint_edges_hold_their_ends_in_link_frames() -> None:
 def test_an_edge_counts_in_both_its_regions() -> None:
     edges = MESH.joint_edges
     assert edges.region_lengths.sum() == pytest.approx(2 * edges.rest_lengths.sum(), rel=1e-4)
-    hand = LINK_INDEX["left_hand"]
-    own = (MESH.vertex_link[edges.vertices] == hand).any(axis=1)
-    assert edges.region_lengths[hand] == pytest.approx(edges.rest_lengths[own].sum(), rel=1e-4)
+    foot = REGION_INDEX["left_foot"]
+    own = (REGIONS[edges.vertices] == foot).any(axis=1)
+    assert edges.region_lengths[foot] == pytest.approx(edges.rest_lengths[own].sum(), rel=1e-4)
+
+
+def test_what_eq_1_divides_by_can_be_all_edges_or_a_fixed_length() -> None:
+    every, fixed = (joint_edges(MESH.mesh, REGIONS, MESH.T_link_world, form) for form in ("all-edges", "fixed-length"))
+    ends = np.array(sorted(all_edges()))
+    lengths = np.linalg.norm(MESH.mesh.vertices[ends[:, 0]] - MESH.mesh.vertices[ends[:, 1]], axis=1)
+    for region in (REGION_INDEX["head"], REGION_INDEX["left_shin"]):
+        own = (REGIONS[ends] == region).any(axis=1)
+        joining = own & (REGION_LINKS[REGIONS[ends]][:, 0] != REGION_LINKS[REGIONS[ends]][:, 1])
+        assert every.region_lengths[region] == pytest.approx(lengths[own].sum(), rel=1e-4)
+        assert fixed.region_lengths[region] == pytest.approx(FIXED_EDGE_M * joining.sum(), rel=1e-4)
+        assert 0 < joining.sum() < own.sum()
 
 
 def test_bridges_over_occlusions_count_but_are_not_drawn() -> None:

@@ -47,6 +47,8 @@ def test_every_commented_key_of_the_example_exists(settings, name, tmp_path):
         ("person = 300", "person: 300"),
         ('[link]\nlisten = ["127.0.0.1:7447"]', "listen: '127.0.0.1:7447' is not a locator"),
         ("[poses]\njpeg_quality = 5", "jpeg_quality: 5"),
+        ("[poses]\nregion_weights = { tumb = 1 }", r"\[poses\] region_weights: no region 'tumb'"),
+        ("[poses]\nregion_weights = { thumb = -1 }", "thumb = -1.* is outside"),
     ],
 )
 def test_a_mistake_is_named(toml, message, tmp_path):

@@ -10,25 +10,14 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from common.body.body_regions import REGION_COUNT
 from common.body.rigged_mesh import JointEdges, RiggedMesh
-from common.body.skeleton import LINK_INDEX, LINK_NAMES, SIDES
 
 START_THRESHOLD = 0.15  # DISPOSE §7.1; its edges are coarser than ours, so the session corrects it at once
 
-_LOW_WEIGHTS = {"hand": 0.5, "fingers": 0.25, "foot": 0.5, "toes": 0.25}
-
-
-def default_region_weights() -> NDArray[np.float32]:
-    """ω (L,) float32: 1, less for hands, fingers, feet and toes, which are prone to capture errors (§5.2)."""
-    weights = np.ones(len(LINK_NAMES), np.float32)
-    for part, weight in _LOW_WEIGHTS.items():
-        for side in SIDES:
-            weights[LINK_INDEX[f"{side}_{part}"]] = weight
-    return weights
-
 
 def distortion_score(mesh: RiggedMesh, T_world_link: NDArray[np.float32], region_weights: NDArray[np.float32]) -> float:
-    """σ of showing ``mesh`` with the links at ``T_world_link`` (L, 4, 4); 0 for its own skeleton.
+    """σ of showing ``mesh`` with the links at ``T_world_link`` (L, 4, 4), with ω (R,); 0 for its own skeleton.
 
     Not commutative: what is hidden in this mesh stretches when it appears, not the other way round.
     """
@@ -38,9 +27,9 @@ def distortion_score(mesh: RiggedMesh, T_world_link: NDArray[np.float32], region
 def distortion_scores(
     edges: JointEdges, T_world_links: NDArray[np.float32], region_weights: NDArray[np.float32]
 ) -> NDArray[np.float32]:
-    """σ (N,) float32 of one mesh's ``edges`` for N skeletons' links (N, L, 4, 4), with ω ``region_weights`` (L,).
+    """σ (N,) float32 of one mesh's ``edges`` for N skeletons' links (N, L, 4, 4), with ω ``region_weights`` (R,).
 
-    Eq. (1): σ_r = Σ|Δlen(e)| / Σ len(e) over the edges joining region r to others, an edge counting in both its
+    Eq. (1): σ_r = Σ|Δlen(e)| / Σ len(e) over the edges joining region r to other links, an edge counting in both its
     regions. Eq. (2): σ = (1/m) Σ ω_r σ_r over the m regions that have such edges. A mesh without a single one cannot
     be judged: its σ is infinite.
     """
@@ -49,12 +38,32 @@ def distortion_scores(
     return _scores(
         edges.points,
         edges.rest_lengths,
+        edges.pair_regions,
         edges.pair_links,
         edges.pair_starts,
         edges.region_lengths,
         region_weights,
         T_world_links,
     )
+
+
+def region_scores(mesh: RiggedMesh, T_world_link: NDArray[np.float32]) -> NDArray[np.float32]:
+    """σ_r (R,) float32 of every region (``REGION_NAMES``), unweighted, for links ``T_world_link`` (L, 4, 4); Eq. (1).
+
+    NaN for a region that no edge joins to another link: it was not seen, or is not the person's.
+    """
+    edges = mesh.joint_edges
+    changes = _region_changes(
+        edges.points,
+        edges.rest_lengths,
+        edges.pair_regions,
+        edges.pair_links,
+        edges.pair_starts,
+        REGION_COUNT,
+        T_world_link,
+    )
+    lengths = edges.region_lengths
+    return np.where(lengths > 0, changes / np.where(lengths > 0, lengths, 1), np.nan).astype(np.float32)
 
 
 class SessionThreshold:
@@ -78,7 +87,7 @@ class SessionThreshold:
 
 
 @njit(nogil=True, cache=True, error_model="numpy", fastmath={"reassoc", "contract", "nsz"})
-def _scores(points, rest, pair_links, pair_starts, region_lengths, omega, T):  # type: ignore[no-untyped-def]
+def _scores(points, rest, pair_regions, pair_links, pair_starts, region_lengths, omega, T):  # type: ignore[no-untyped-def]
     regions = 0
     for r in range(len(region_lengths)):
         regions += region_lengths[r] > 0
@@ -86,18 +95,35 @@ def _scores(points, rest, pair_links, pair_starts, region_lengths, omega, T):  #
     R, t = np.empty((3, 3), np.float32), np.empty(3, np.float32)
     for n in range(len(T)):
         for p in range(len(pair_links)):
-            a, b = pair_links[p, 0], pair_links[p, 1]
-            for i in range(3):  # link b seen from link a
-                t[i] = 0
-                for k in range(3):
-                    t[i] += T[n, a, k, i] * (T[n, b, k, 3] - T[n, a, k, 3])
-                for j in range(3):
-                    R[i, j] = (
-                        T[n, a, 0, i] * T[n, b, 0, j] + T[n, a, 1, i] * T[n, b, 1, j] + T[n, a, 2, i] * T[n, b, 2, j]
-                    )
+            a, b = pair_regions[p, 0], pair_regions[p, 1]
+            _seen_from(T[n], pair_links[p, 0], pair_links[p, 1], R, t)
             change = _length_change(points, rest, pair_starts[p], pair_starts[p + 1], R, t)
             out[n] += change * (omega[a] / region_lengths[a] + omega[b] / region_lengths[b]) / regions
     return out
+
+
+@njit(nogil=True, cache=True, error_model="numpy", fastmath={"reassoc", "contract", "nsz"})
+def _region_changes(points, rest, pair_regions, pair_links, pair_starts, region_count, T):  # type: ignore[no-untyped-def]
+    """Σ|Δlen(e)| (R,) [m] of each region's edges."""
+    out = np.zeros(region_count, np.float32)
+    R, t = np.empty((3, 3), np.float32), np.empty(3, np.float32)
+    for p in range(len(pair_links)):
+        _seen_from(T, pair_links[p, 0], pair_links[p, 1], R, t)
+        change = _length_change(points, rest, pair_starts[p], pair_starts[p + 1], R, t)
+        out[pair_regions[p, 0]] += change
+        out[pair_regions[p, 1]] += change
+    return out
+
+
+@njit(nogil=True, cache=True, error_model="numpy", fastmath={"reassoc", "contract", "nsz"})
+def _seen_from(T, a, b, R, t):  # type: ignore[no-untyped-def]
+    """Rotation ``R`` and place ``t`` of link b in the frame of link a, of links ``T`` (L, 4, 4)."""
+    for i in range(3):
+        t[i] = 0
+        for k in range(3):
+            t[i] += T[a, k, i] * (T[b, k, 3] - T[a, k, 3])
+        for j in range(3):
+            R[i, j] = T[a, 0, i] * T[b, 0, j] + T[a, 1, i] * T[b, 1, j] + T[a, 2, i] * T[b, 2, j]
 
 
 @njit(nogil=True, cache=True, error_model="numpy", fastmath={"reassoc", "contract", "nsz"})

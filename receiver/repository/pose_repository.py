@@ -11,7 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from common.body.distortion_score import default_region_weights, distortion_scores
+from common.body.body_regions import default_region_weights
+from common.body.distortion_score import distortion_scores
 from common.body.rigged_mesh import RiggedMesh
 from common.body.skeleton_pose import forward_kinematics
 

@@ -9,7 +9,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from common.body.distortion_score import START_THRESHOLD, SessionThreshold, default_region_weights, distortion_score
+from common.body.body_regions import default_region_weights
+from common.body.distortion_score import START_THRESHOLD, SessionThreshold, distortion_score
 from common.body.rigged_mesh import RiggedMesh
 
 

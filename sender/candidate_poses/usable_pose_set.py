@@ -13,7 +13,8 @@ from enum import StrEnum
 import numpy as np
 from numpy.typing import NDArray
 
-from common.body.distortion_score import SessionThreshold, default_region_weights, distortion_scores
+from common.body.body_regions import default_region_weights
+from common.body.distortion_score import SessionThreshold, distortion_scores
 from common.body.rigged_mesh import JointEdges, RiggedMesh
 from common.body.skeleton import LINK_COUNT
 from common.body.skeleton_pose import forward_kinematics
