@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 from pathlib import Path
+from urllib.parse import urlsplit
 
 from common.runtime.config_file import SettingsError, load_settings
 from common.runtime.daemon import leave, run_daemon, set_up_logging
@@ -12,10 +13,13 @@ from common.runtime.daemon_options import add_daemon_options, overrides
 from common.runtime.threads import prepare_threads
 from receiver.config import ReceiverSettings
 
+EXPORT_SUFFIXES = (".glb", ".ply")
 EXAMPLES = """examples:
   telepose-receive                                    the sender on this host; the page is http://127.0.0.1:8080/
   telepose-receive -e tcp/192.0.2.7:7447              the sender on another host
+  telepose-receive --window                           a desktop window besides the page
   telepose-receive --headless --log-shown shown.log   no page: render offscreen and keep what was shown
+  telepose-receive export person.glb person.ply       the person whom a running receiver shows now, as files
 """
 
 
@@ -32,6 +36,9 @@ def parse_arguments(arguments: list[str] | None = None) -> argparse.Namespace:
         "--headless", dest="view.headless", action="store_true", default=None, help="no page: render offscreen"
     )
     view.add_argument(
+        "--window", dest="view.window", action="store_true", default=None, help="a desktop window too (Open3D)"
+    )
+    view.add_argument(
         "--log-shown", dest="shown_log", type=Path, metavar="FILE", help="keep what was shown, for measuring"
     )
     view.add_argument("--name", dest="name", metavar="NAME", help="this receiver, in keys and logs")
@@ -39,8 +46,70 @@ def parse_arguments(arguments: list[str] | None = None) -> argparse.Namespace:
     return parser.parse_args(arguments)
 
 
+def parse_export_arguments(arguments: list[str]) -> argparse.Namespace:
+    """What follows ``telepose-receive export`` → ``files``, ``page``, ``wait_s``."""
+    parser = argparse.ArgumentParser(
+        prog="telepose-receive export",
+        description="Writes the person whom a running receiver shows at this moment: as GLB (textured, with the "
+        "skeleton; bends by linear blend) or PLY (a colour per vertex).",
+    )
+    parser.add_argument("files", nargs="+", type=_export_file, metavar="FILE", help="ends in .glb or .ply")
+    parser.add_argument(
+        "--page",
+        type=_page,
+        default="http://127.0.0.1:8080/",
+        metavar="URL",
+        help="the receiver's (default %(default)s)",
+    )
+    parser.add_argument(
+        "--wait", dest="wait_s", type=_seconds, default=10.0, metavar="S", help="for somebody to appear (default 10)"
+    )
+    return parser.parse_args(arguments)
+
+
+def _export_file(text: str) -> Path:
+    if Path(text).suffix.lower() not in EXPORT_SUFFIXES:
+        raise argparse.ArgumentTypeError(f"{text!r} does not end in {' or '.join(EXPORT_SUFFIXES)}")
+    return Path(text)
+
+
+def _page(text: str) -> str:
+    try:
+        parts = urlsplit(text)
+        good = parts.scheme in ("http", "https") and bool(parts.hostname) and parts.port != 0
+    except ValueError:  # a port that is no number, a bracket too many
+        good = False
+    if not good:
+        raise argparse.ArgumentTypeError(f"{text!r} is not the address of a page, such as http://127.0.0.1:8080/")
+    return text
+
+
+def _seconds(text: str) -> float:
+    try:
+        seconds = float(text)
+    except ValueError:
+        seconds = 0.0
+    if not 0 < seconds <= 3600:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a time of up to 3600 seconds")
+    return seconds
+
+
+def run_export(arguments: list[str]) -> None:
+    """``telepose-receive export``; exits with a sentence and code 1 where it cannot."""
+    options = parse_export_arguments(arguments)
+    from receiver.export import export  # OpenCV takes a while: not for --help or a wrong option
+    from receiver.viewer.person_files import ExportError
+
+    try:
+        export(options.page, options.files, options.wait_s)
+    except ExportError as error:
+        sys.exit(f"telepose-receive export: {error}")
+
+
 def main() -> None:
     """Entry point of the console script."""
+    if sys.argv[1:2] == ["export"]:
+        return run_export(sys.argv[2:])
     options = parse_arguments()
     set_up_logging(options.log_level)
     prepare_threads()

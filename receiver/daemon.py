@@ -10,7 +10,7 @@ import asyncio
 import logging
 import secrets
 from collections import Counter, deque
-from collections.abc import Callable
+from collections.abc import Callable, Coroutine
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from typing import Any
@@ -35,6 +35,7 @@ from receiver.show_log import ShowLog
 from receiver.stream_state import StreamState
 from receiver.viewer.headless_screen import HeadlessScreen
 from receiver.viewer.web_viewer import WebViewer
+from receiver.viewer.window_process import run_window
 
 log = logging.getLogger(__name__)
 
@@ -70,7 +71,7 @@ class ReceiverDaemon:
                 async with serve_app(app, settings.http.host, settings.http.port) as port:
                     what = "metrics" if settings.view.headless else "the page"
                     log.info("%s on http://%s:%d/", what, settings.http.host, port)
-                    await show.run(daemon)
+                    await show.run(daemon, _page_address(settings.http.host, port))
             except OSError as error:
                 raise DaemonError(f"http: {error}") from error
             finally:
@@ -109,23 +110,30 @@ class _Show:
         )
         self.metrics = self._make_metrics()
 
-    async def run(self, daemon: Daemon) -> None:
-        """Receive and show until cancelled."""
+    async def run(self, daemon: Daemon, page: str) -> None:
+        """Receive and show until cancelled, or until the window on ``page`` is closed where there is one."""
         self._channels.open(
             Handlers(self._on_skeleton, self._on_pose, self._on_body, self._on_epoch, self._state.presence)
         )
+        lasting: list[Coroutine[Any, Any, None]] = [
+            self._animation.run(),
+            self._mesh_poses(),
+            self._every(REPORT_PERIOD_S, self._report),
+            self._every(STATUS_PERIOD_S, self._tell_status),
+            self._every(1 / self._settings.view.display_hz, self._tick),
+            self._keep_time(),
+            self._keep_body(),
+        ]
+        if isinstance(self.viewer, HeadlessScreen):
+            lasting.append(self.viewer.run())
         async with asyncio.TaskGroup() as group:
-            group.create_task(self._animation.run())
-            group.create_task(self._mesh_poses())
-            group.create_task(self._every(REPORT_PERIOD_S, self._report))
-            group.create_task(self._every(STATUS_PERIOD_S, self._tell_status))
-            group.create_task(self._every(1 / self._settings.view.display_hz, self._tick))
-            group.create_task(self._keep_time())
-            group.create_task(self._keep_body())
-            if isinstance(self.viewer, HeadlessScreen):
-                group.create_task(self.viewer.run())
+            tasks = [group.create_task(part) for part in lasting]
             await self._animation.wait_ready()
             daemon.announce_ready()
+            if self._settings.view.window:
+                await run_window(page)
+                for task in tasks:
+                    task.cancel()
 
     def close(self) -> None:
         """Hear nothing more, and write out what is buffered."""
@@ -287,3 +295,9 @@ class _Show:
             "bulk_bytes": self._channels.subscribers["bulk"].arrived_bytes if self._channels.subscribers else 0,
             "dropped": self._dropped(),
         }
+
+
+def _page_address(host: str, port: int) -> str:
+    """Where this host itself reaches the page."""
+    here = {"0.0.0.0": "127.0.0.1", "": "127.0.0.1", "::": "::1"}.get(host, host)
+    return f"http://[{here}]:{port}/" if ":" in here else f"http://{here}:{port}/"

@@ -124,11 +124,11 @@ class Site:
         command = [str(BIN / "telepose-send"), "-l", self.link, "--http-port", str(port), *source, *files, *options]
         return self._start("sender", command, port)
 
-    def receiver(self, *options: str, name: str = "receiver") -> Running:
-        """A headless receiver."""
+    def receiver(self, *options: str, name: str = "receiver", headless: bool = True) -> Running:
+        """A receiver, with a page unless it is ``headless``."""
         port = free_port()
-        files = ["--stats", str(self.folder / f"{name}.json")]
-        command = [str(BIN / "telepose-receive"), "-e", self.link, "--http-port", str(port), "--headless", *files]
+        files = ["--stats", str(self.folder / f"{name}.json"), *(["--headless"] if headless else [])]
+        command = [str(BIN / "telepose-receive"), "-e", self.link, "--http-port", str(port), *files]
         return self._start(name, [*command, *options], port)
 
     def figures(self, name: str) -> dict[str, Any]:

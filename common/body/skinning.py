@@ -14,6 +14,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from common.body.rigged_mesh import RiggedMesh
+from common.body.vertex_blend import VertexBlend
 from common.geometry import quaternion
 
 Skinning = Literal["rigid", "linear", "spherical"]
@@ -36,13 +37,24 @@ def captured_joints(mesh: RiggedMesh) -> NDArray[np.float32]:
 
 def animate(mesh: RiggedMesh, motion: NDArray[np.float32], skinning: Skinning = "spherical") -> NDArray[np.float32]:
     """Vertices (V, 3) float32 [m, world] at the links' ``motion`` (L, 3, 4)."""
-    vertices, link, blend = mesh.mesh.vertices, mesh.vertex_link, mesh.blend
+    return move(mesh.mesh.vertices, mesh.vertex_link, mesh.blend, captured_joints(mesh), motion, skinning)
+
+
+def move(
+    vertices: NDArray[np.float32],
+    vertex_link: NDArray[np.uint8],
+    blend: VertexBlend,
+    joints: NDArray[np.float32],
+    motion: NDArray[np.float32],
+    skinning: Skinning,
+) -> NDArray[np.float32]:
+    """``animate`` of a mesh's parts: ``vertices`` (V, 3) and ``joints`` (L, 3) [m, world] are those at capture."""
     if skinning == "rigid":
-        return _move(vertices, link, motion)
+        return _move(vertices, vertex_link, motion)
     if skinning == "linear":
-        return _linear(vertices, link, blend.other, blend.share, motion)
+        return _linear(vertices, vertex_link, blend.other, blend.share, motion)
     turns = quaternion.from_matrix(motion[:, :, :3].astype(np.float64)).astype(np.float32)
-    return _spherical(vertices, link, blend.other, blend.share, blend.joint, motion, turns, captured_joints(mesh))
+    return _spherical(vertices, vertex_link, blend.other, blend.share, blend.joint, motion, turns, joints)
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
