@@ -261,6 +261,8 @@ class _Show:
         metrics.counter("frames_shown_total", "Frames given to the viewer", lambda: self._state.frames_shown)
         metrics.counter("dropped_total", "What was dropped, by cause", self._dropped)
         metrics.gauge("repository_poses", "Candidate poses held", lambda: self._state.repository_poses)
+        about = "Distortion of each region of the mesh on screen (DISPOSE Eq. 1)"
+        metrics.gauge("region_sigma", about, lambda: self._state.region_sigma, "region")
         return metrics
 
     def _dropped(self) -> dict[str, float]:

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from common.body.body_regions import region_weights
+from common.body.distortion_score import region_scores
 from common.body.rigged_mesh import RiggedMesh, ScoreForm, build_rigged_mesh
 from common.body.skeleton import Skeleton
 from common.body.skeleton_pose import forward_kinematics
@@ -172,6 +173,7 @@ def _frame(
         motion=None if mesh is None else link_motion(mesh, T_world_link),
         joints=np.ascontiguousarray(T_world_link[:, :3, 3]),
         sigma=sigma,
+        region_sigma=None if mesh is None else region_scores(mesh, T_world_link),
         fit_confidence=packet.fit_confidence,
         confidence=packet.pose.confidence,
     )

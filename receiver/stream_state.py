@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
 
+from common.body.body_regions import REGION_NAMES
 from common.runtime.clock import Clock
 from receiver.viewer.viewer import ConnectionState, ShownFrame, ViewerStatus
 
@@ -64,7 +66,16 @@ class StreamState:
             repository_poses=self.repository_poses,
             chosen_pose=frame.pose_id if frame is not None else None,
             sigma=frame.sigma if frame is not None and has_pose else None,
+            region_sigma=self.region_sigma,
         )
+
+    @property
+    def region_sigma(self) -> dict[str, float]:
+        """σ_r of the pose on screen by region, without those that were not seen."""
+        if self.frame is None or self.frame.region_sigma is None:
+            return {}
+        named = zip(REGION_NAMES, self.frame.region_sigma.tolist(), strict=True)
+        return {name: sigma for name, sigma in named if math.isfinite(sigma)}
 
     def _connection(self) -> tuple[ConnectionState, str]:
         if self.receiving:

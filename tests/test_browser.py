@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import dataclasses
 import itertools
 from collections.abc import AsyncIterator, Callable
 from contextlib import AsyncExitStack, asynccontextmanager
@@ -14,6 +15,7 @@ from aiohttp import web
 from aiohttp.test_utils import TestServer, unused_port
 from numpy.typing import NDArray
 
+from common.body.body_regions import REGION_COUNT
 from common.body.skinning import Skinning
 from common.geometry.camera_model import Camera
 from receiver.viewer.offscreen_viewer import OffscreenViewer
@@ -35,6 +37,7 @@ RECEIVING = ViewerStatus(
     repository_poses=12,
     chosen_pose=7,
     sigma=0.0314,
+    region_sigma={"head": 0.01, "left_forearm": 0.52, "right_thumb": 0.2},
 )
 STATE = "document.body.dataset.state"
 HEADLINE = "document.getElementById('banner-title').textContent"
@@ -152,8 +155,10 @@ async def test_figures_and_keys() -> None:
         await page.wait_for(figure("fps"), lambda text: text.endswith(" fps") and int(text.split()[0]) > 0)
         age = await page.wait_for(figure("age"), lambda text: text.endswith(" ms"))
         assert int(age.split()[0]) >= 42  # the frame's own age, and the time it waited here
-        shown = [await page.evaluate(figure(name)) for name in ("skeleton", "bulk", "repository", "pose", "sigma")]
-        assert shown == ["71.3 kbit/s", "1913 kbit/s", "12 poses", "#7", "0.031"]
+        shown = [
+            await page.evaluate(figure(name)) for name in ("skeleton", "bulk", "repository", "pose", "sigma", "region")
+        ]
+        assert shown == ["71.3 kbit/s", "1913 kbit/s", "12 poses", "#7", "0.031", "left forearm 0.520"]
 
         overlay = (127, 216, 255)
         assert coloured(await page.photograph(), overlay).sum() == 0
@@ -164,6 +169,36 @@ async def test_figures_and_keys() -> None:
         assert await page.evaluate(visible)
         await page.press("h")
         await page.wait_for(f"!({visible})")
+        assert page.problems == []
+
+
+async def test_regions_are_coloured_by_their_distortion() -> None:
+    async with receiver() as (viewer, url), person_moving(viewer), open_page(url, 1000, 700) as page:
+        strokes = "[...document.querySelectorAll('#regions line')].map((line) => line.getAttribute('stroke'))"
+        shown = await page.wait_for(strokes)
+        assert len(shown) == REGION_COUNT
+        hues = sorted(int(stroke[4:].split()[0]) for stroke in shown if stroke.startswith("hsl"))
+        assert hues == [43, 78, 148]  # red for the forearm, green for the head; the others were not seen
+        assert page.problems == []
+
+
+async def test_a_withheld_frame_is_marked_and_the_next_is_not() -> None:
+    person = capsule_person(pose_id=7)
+    good = shown_frame(person, 0.8)
+    mark = "Number(getComputedStyle(document.getElementById('withheld')).opacity)"
+    async with receiver() as (viewer, url), open_page(url, 800, 600) as page:
+        viewer.add_pose(person)
+        viewer.set_status(RECEIVING)
+        viewer.show(good)
+        await photograph_when(page, lambda p: coloured(p, SHIRT).sum() > 500)
+        assert await page.evaluate(mark) == 0
+        viewer.show(dataclasses.replace(good, withheld=True))
+        await page.wait_for(mark, lambda opacity: opacity == 1)
+        faded = await page.photograph()
+        assert coloured(faded, SHIRT).sum() == 0
+        viewer.show(shown_frame(person, 0.9))
+        await page.wait_for(mark, lambda opacity: opacity == 0)
+        await photograph_when(page, lambda p: coloured(p, SHIRT).sum() > 500)
         assert page.problems == []
 
 

@@ -140,6 +140,12 @@ def test_frame_message_holds_the_frame_in_half_a_megabit() -> None:
     assert len(message) * 8 * 30 < 500_000
 
 
+def test_a_withheld_frame_is_marked() -> None:
+    frame = shown_frame(PERSON, time_s=1.3)
+    assert page_messages.encode_frame(frame)[2] == 0
+    assert page_messages.encode_frame(dataclasses.replace(frame, withheld=True))[2] == 1
+
+
 def test_frame_without_a_pose_says_so() -> None:
     message = page_messages.encode_frame(shown_frame(None, time_s=0.0))
     assert struct.unpack_from("<I", message, 4)[0] == page_messages.NO_POSE
@@ -150,13 +156,16 @@ def test_remove_message_names_the_pose() -> None:
 
 
 def test_status_is_json_even_where_numbers_are_missing() -> None:
-    status = ViewerStatus(ConnectionState.RECEIVING, "", 29.9, float("nan"), 71_000.0, sigma=float("inf"))
+    status = ViewerStatus(
+        ConnectionState.RECEIVING, "", 29.9, float("nan"), 71_000.0, sigma=float("inf"), region_sigma={"head": 0.5}
+    )
     figures = json.loads(page_messages.encode_status(status), parse_constant=pytest.fail)
     assert figures["kind"] == "status"
     assert figures["connection"] == "receiving"
     assert figures["skeleton_bps"] == 71_000.0
     assert figures["pose_age_ms"] is None
     assert figures["sigma"] is None
+    assert figures["region_sigma"] == {"head": 0.5}
 
 
 def test_hello_tells_the_link_tree() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 
 import numpy as np
@@ -70,6 +71,14 @@ def test_nobody_without_a_pose_and_after_its_removal() -> None:
     assert view_of(POSE, FRAME, encode_frame(shown_frame(None, 0.0))).person is None
     assert view_of(POSE, FRAME, encode_remove(7)).person is None
     assert view_of(POSE, FRAME, encode_remove(8)).person is not None
+
+
+def test_a_withheld_frame_is_told() -> None:
+    frame = shown_frame(PERSON, 1.3)
+    for withheld in (False, True):
+        view = view_of(POSE, encode_frame(dataclasses.replace(frame, withheld=withheld)))
+        assert view.person is not None
+        assert view.person.frame.withheld == withheld
 
 
 def test_the_picture_is_live_while_the_receiver_receives() -> None:

@@ -8,6 +8,7 @@ from collections import deque
 import numpy as np
 import pytest
 
+from common.body.body_regions import REGION_INDEX, default_region_weights
 from common.body.skeleton import Skeleton
 from common.body.skeleton_pose import named_joint_positions, rest_pose
 from common.runtime.clock import ManualClock
@@ -134,6 +135,11 @@ def test_a_received_pose_is_animated_by_the_next_skeleton():
     assert shown.frame is not None
     assert shown.frame.pose_id == pose.mesh.pose_id
     assert np.isfinite(shown.frame.sigma)
+    assert shown.frame.region_sigma is not None
+    seen = np.isfinite(shown.frame.region_sigma)
+    assert seen[REGION_INDEX["left_forearm"]]
+    weighted = (shown.frame.region_sigma * default_region_weights())[seen]
+    assert weighted.mean() == pytest.approx(shown.frame.sigma, rel=1e-3)  # DISPOSE Eq. (2)
     moved = np.abs(shown.frame.motion - np.eye(3, 4)).max()
     assert 0 < moved < 1
 

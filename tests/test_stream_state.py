@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 
+from common.body.body_regions import REGION_COUNT, REGION_INDEX
 from common.body.skeleton import LINK_COUNT
 from common.runtime.clock import ManualClock
 from receiver.stream_state import StreamState
@@ -16,6 +19,18 @@ def frame(pose_id: int | None) -> ShownFrame:
     motion = None if pose_id is None else np.zeros((LINK_COUNT, 3, 4), np.float32)
     joints, confidence = np.zeros((LINK_COUNT, 3), np.float32), np.ones(LINK_COUNT, np.float32)
     return ShownFrame(0, 1, pose_id, motion, joints, 0.4 if pose_id is not None else float("nan"), 1.0, confidence)
+
+
+def test_distortion_is_told_for_the_regions_seen_of_the_pose_on_screen():
+    state = StreamState(ManualClock())
+    assert state.region_sigma == {}
+    sigma = np.full(REGION_COUNT, np.nan, np.float32)
+    sigma[REGION_INDEX["left_palm"]], sigma[REGION_INDEX["head"]] = 0.5, 0.0
+    state.shown(dataclasses.replace(frame(7), region_sigma=sigma), 1)
+    assert state.region_sigma == {"left_palm": 0.5, "head": 0.0}
+    assert state.status(None, 0, 0).region_sigma == state.region_sigma
+    state.shown(frame(None), 1)
+    assert state.region_sigma == {}
 
 
 def test_before_anything_came_it_waits():

@@ -8,7 +8,8 @@ four bytes, so that the page reads typed arrays in place (``web/src/messages.js`
   corner), ``link u8[V, 4]`` (its link, the neighbour that also moves it, the joint between them, the neighbour's part
   in 1/255), ``joints f32[L, 3]`` at capture, ``index u16[F, 3]`` (u32 if V > 65,536), padding, and the texture as JPEG.
 - FRAME, every skeleton: ``pose_id u32, sequence u32, sigma f32, fit_confidence f32, age_ms f32, motion f32[L, 3, 4],
-  joints f32[L, 3], confidence u8[L]``, padding: 1,432 bytes, 0.34 Mbit/s at 30 Hz.
+  joints f32[L, 3], confidence u8[L]``, padding: 1,432 bytes, 0.34 Mbit/s at 30 Hz. The first of its two zero bytes is
+  1 when it is withheld: the last good picture once more.
 - REMOVE: ``pose_id u32``.
 
 The page answers each binary message with one ``u32``: how many it has taken in so far.
@@ -33,7 +34,7 @@ from receiver.viewer.viewer import ShownFrame, ViewerStatus
 if TYPE_CHECKING:
     from common.body.rigged_mesh import RiggedMesh
 
-VERSION = 3
+VERSION = 4
 POSE, FRAME, REMOVE = 1, 2, 3
 NO_POSE = 0xFFFFFFFF
 QUANTIZATION_STEPS = 65535
@@ -42,6 +43,7 @@ JPEG_QUALITY = 90  # above the received views' own: a second coding should add l
 TEXTURE_SIDE_MAX = 8192  # pixels; what browsers' GPUs take
 
 _HEADER = struct.Struct("<BBxx")
+_FRAME_HEADER = struct.Struct("<BB?x")
 _POSE = struct.Struct("<III3f3f")
 _FRAME = struct.Struct("<IIfff")
 _REMOVE = struct.Struct("<I")
@@ -81,7 +83,13 @@ def encode_frame(frame: ShownFrame) -> bytes:
     motion = np.zeros((LINK_COUNT, 3, 4), np.float32) if frame.motion is None else frame.motion
     head = _FRAME.pack(pose_id, frame.sequence, frame.sigma, frame.fit_confidence, frame.age_ms)
     confidence = np.rint(np.clip(frame.confidence, 0, 1) * 255).astype(np.uint8)
-    parts = (_HEADER.pack(VERSION, FRAME), head, _floats(motion), _floats(frame.joints), _padded(confidence.tobytes()))
+    parts = (
+        _FRAME_HEADER.pack(VERSION, FRAME, frame.withheld),
+        head,
+        _floats(motion),
+        _floats(frame.joints),
+        _padded(confidence.tobytes()),
+    )
     return b"".join(parts)
 
 

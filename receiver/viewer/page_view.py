@@ -50,12 +50,14 @@ class PageMesh:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PageFrame:
-    """A FRAME message: ``motion`` (L, 3, 4) float32 of the pose's links, ``joints`` (L, 3) float32 [m, world] now."""
+    """A FRAME message: ``motion`` (L, 3, 4) float32 of the pose's links, ``joints`` (L, 3) float32 [m, world] now;
+    ``withheld``: the last good picture again, as the newest skeleton would tear it."""
 
     pose_id: int | None
     sequence: int
     motion: NDArray[np.float32]
     joints: NDArray[np.float32]
+    withheld: bool
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -164,7 +166,7 @@ def decode_frame(message: bytes) -> PageFrame:
     joints = np.frombuffer(message, "<f4", 3 * LINK_COUNT, 24 + 48 * LINK_COUNT).reshape(-1, 3)
     if not (np.isfinite(motion).all() and np.isfinite(joints).all()):
         raise ValueError("frame: a motion or joint that is not finite")
-    return PageFrame(None if pose_id == NO_POSE else pose_id, sequence, motion, joints)
+    return PageFrame(None if pose_id == NO_POSE else pose_id, sequence, motion, joints, message[2] == 1)
 
 
 def decode_pose(message: bytes) -> PageMesh:

@@ -6,7 +6,8 @@ frames name the pose they move. A viewer never blocks and never queues without a
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import TYPE_CHECKING, Protocol
 
@@ -35,8 +36,10 @@ class ShownFrame:
     the repository is empty (then ``motion`` is None too and only the joints are known).
     ``motion`` (L, 3, 4) float32: T_world_link(now) · T_link_world(at capture), moves the mesh's world vertices.
     ``joints`` (L, 3) float32 [m, world]: link origins. ``sigma``: distortion score σ of the drawn pose (nan: none).
+    ``region_sigma`` (R,) float32: its σ_r by region (``REGION_NAMES``; nan: not seen), None without a pose.
     ``fit_confidence``: 0..1. ``confidence`` (L,) float32: 0 = that link was not seen.
     ``age_ms``: time from capture to this call [ms], nan while the clock offset to the sender is unknown.
+    ``withheld``: the newest skeleton would distort every mesh too much (DISPOSE §8); this is the last good frame again.
 
     Raises:
         ValueError: wrong shapes, or a motion without a pose.
@@ -48,9 +51,11 @@ class ShownFrame:
     motion: NDArray[np.float32] | None
     joints: NDArray[np.float32]
     sigma: float
+    region_sigma: NDArray[np.float32] | None = field(default=None, kw_only=True)
     fit_confidence: float
     confidence: NDArray[np.float32]
     age_ms: float = float("nan")
+    withheld: bool = False
 
     def __post_init__(self) -> None:
         if (self.pose_id is None) != (self.motion is None):
@@ -68,7 +73,7 @@ class ViewerStatus:
     ``detail``: one sentence for a person where something is missing ("no person in view"), else "".
     ``frame_rate_hz``: skeletons received per second. ``pose_age_ms``: capture to screen [ms], None while unknown.
     ``skeleton_bps``, ``bulk_bps``: payload received [bit/s]. ``chosen_pose``: id of the pose drawn, None = none.
-    ``sigma``: its distortion score σ, None = none.
+    ``sigma``: its distortion score σ, None = none. ``region_sigma``: σ_r of the regions seen.
     """
 
     connection: ConnectionState = ConnectionState.WAITING
@@ -80,6 +85,7 @@ class ViewerStatus:
     repository_poses: int = 0
     chosen_pose: int | None = None
     sigma: float | None = None
+    region_sigma: Mapping[str, float] = field(default_factory=dict)
 
 
 class Viewer(Protocol):

@@ -1,5 +1,7 @@
 // The figures and the banner.
 
+import { RegionMap } from "./regions.js";
+
 const BANNERS = {
   connecting: ["Connecting…", ""],
   disconnected: ["Connection lost", "The receiver does not answer. This page keeps trying."],
@@ -17,6 +19,7 @@ export class Hud {
     this.title = document.getElementById("banner-title");
     this.detail = document.getElementById("banner-detail");
     this.note = document.getElementById("note");
+    this.regions = new RegionMap(document.getElementById("regions"));
     this.ages = [];
     this.drawn = 0;
     this.since = performance.now();
@@ -41,7 +44,13 @@ export class Hud {
     this.write("repository", `${status.repository_poses} poses`);
     this.write("pose", status.chosen_pose === null ? null : `#${status.chosen_pose}`);
     this.write("sigma", status.sigma?.toFixed(3));
+    this.write("region", this.regions.show(status.region_sigma));
     this.receivedAgeMs = status.pose_age_ms;
+  }
+
+  /** Whether the picture is the last good one, since the newest skeleton would tear it. */
+  setWithheld(withheld) {
+    document.body.classList.toggle("withheld", withheld);
   }
 
   /** A new pose is on screen. */

@@ -7,6 +7,8 @@ import { Person } from "./person.js";
 import { SkeletonOverlay } from "./skeleton.js";
 import { Stage } from "./stage.js";
 
+const WITHHELD_PRESENCE = 0.6;
+
 const hud = new Hud();
 const stage = openStage(document.getElementById("stage"));
 const person = new Person(stage.scene);
@@ -15,6 +17,7 @@ const skeleton = new SkeletonOverlay(stage.scene);
 let newest = null; // the frame to draw next; an older one not drawn yet is skipped
 let capturedAt = NaN; // when what is on screen was captured, on this page's clock
 let drawnAt = performance.now();
+let withheld = false; // the last good picture is kept
 
 connect({
   hello({ link_parents, skinning }) {
@@ -55,7 +58,8 @@ function openStage(canvas) {
 }
 
 function setPresence() {
-  person.presence = hud.live ? 1 : 0;
+  hud.setWithheld(withheld && hud.live);
+  person.presence = !hud.live ? 0 : withheld ? WITHHELD_PRESENCE : 1;
   stage.changed = true;
 }
 
@@ -65,7 +69,9 @@ function draw(now) {
     person.show(newest);
     skeleton.show(newest);
     stage.follow(newest.joints, (now - drawnAt) / 1000);
-    hud.countFrame();
+    if (!newest.withheld) hud.countFrame();
+    withheld = newest.withheld;
+    setPresence();
     capturedAt = newest.capturedAt;
     newest = null;
     drawnAt = now;

@@ -1,6 +1,6 @@
 // The page's end of receiver/viewer/page_messages.py: typed arrays read in place, little-endian.
 
-export const VERSION = 3;
+export const VERSION = 4;
 const KINDS = { 1: decodePose, 2: decodeFrame, 3: decodeRemove };
 const NO_POSE = 0xffffffff;
 export const LINKS = 23;
@@ -40,6 +40,7 @@ function decodeFrame(buffer, view) {
   return {
     kind: "frame",
     poseId: poseId === NO_POSE ? null : poseId,
+    withheld: view.getUint8(2) === 1,
     ageMs: view.getFloat32(20, true),
     motion: new Float32Array(buffer, 24, LINKS * 12),
     joints: new Float32Array(buffer, 24 + LINKS * 48, LINKS * 3),
