@@ -67,6 +67,7 @@ class ReceiverChannels:
         self._clock = clock
         self._arrivals = BulkArrivals()
         self._skeleton_delay, self._bulk_delay = LeastDelay(), LeastDelay()
+        self.first_skeleton_ns: int | None = None  # when the very first one arrived
         self._skeleton_arrival_ns = 0
         self._bodies = _Bodies()
         self._reports = 0
@@ -148,6 +149,8 @@ class ReceiverChannels:
         if before is not None and before.epoch != packet.epoch:
             self.clock_offset.forget()
             self._handlers.epoch()
+        if self.first_skeleton_ns is None:
+            self.first_skeleton_ns = arrival.arrival_ns
         self._skeleton_arrival_ns = arrival.arrival_ns
         self._skeleton_delay.note(packet.send_ns, arrival.arrival_ns)
         if self._knows(packet):

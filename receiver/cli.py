@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import argparse
+import os
+import signal
 import sys
+import threading
 from pathlib import Path
 from urllib.parse import urlsplit
 
@@ -42,6 +45,7 @@ def parse_arguments(arguments: list[str] | None = None) -> argparse.Namespace:
         "--log-shown", dest="shown_log", type=Path, metavar="FILE", help="keep what was shown, for measuring"
     )
     view.add_argument("--name", dest="name", metavar="NAME", help="this receiver, in keys and logs")
+    parser.add_argument("--exit-with-parent", action="store_true", default=None, help="stop when standard input ends")
     add_daemon_options(parser)
     return parser.parse_args(arguments)
 
@@ -111,6 +115,8 @@ def main() -> None:
     if sys.argv[1:2] == ["export"]:
         return run_export(sys.argv[2:])
     options = parse_arguments()
+    if vars(options).pop("exit_with_parent"):
+        threading.Thread(target=_stop_when_input_ends, name="parent", daemon=True).start()
     set_up_logging(options.log_level)
     prepare_threads()
     try:
@@ -120,3 +126,10 @@ def main() -> None:
     from receiver.daemon import ReceiverDaemon  # numba and OpenCV take a second: not for --help or a wrong setting
 
     leave(run_daemon("telepose-receive", ReceiverDaemon(settings).run, options.ready_file))
+
+
+def _stop_when_input_ends() -> None:
+    """Whoever started this process holds the other end: it is closed when they end, however they do."""
+    while os.read(sys.stdin.fileno(), 4096):
+        pass
+    os.kill(os.getpid(), signal.SIGTERM)

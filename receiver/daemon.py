@@ -102,6 +102,7 @@ class _Show:
         self._mesher = ThreadPoolExecutor(1, "mesher", into_background)
         self._messages: asyncio.Queue[bytes] = asyncio.Queue(MESHES_WAITING)
         self._meshes: deque[ReceivedPose] = deque()  # meshed, waiting for the next skeleton; bounded in _mesh_poses
+        self._newest: SkeletonToShow | None = None
         self._log = ShowLog(settings.shown_log) if settings.shown_log else None
         self.viewer: WebViewer | HeadlessScreen = (
             HeadlessScreen(self._timer, skinning=settings.view.skinning)
@@ -145,7 +146,8 @@ class _Show:
     def _on_skeleton(self, packet: SkeletonPacket, body: Skeleton, data: bytes) -> None:
         self._state.skeleton()
         self._record("skeleton", data)
-        self._animation.submit(SkeletonToShow(packet, body, self._meshes))
+        self._newest = SkeletonToShow(packet, body, self._meshes)
+        self._animation.submit(self._newest)
 
     def _on_body(self, message: bytes) -> None:
         self._record("body", message)
@@ -180,6 +182,8 @@ class _Show:
                 self._meshes.popleft()
                 self._counts["pose waiting too long"] += 1
             self._meshes.append(mesh)
+            if self._state.first_body_ns is None and self._newest is not None:
+                self._animation.submit(self._newest)  # the first sight waits for no other skeleton
 
     def _on_shown(self, shown: Shown) -> None:
         """On the loop: the animated mesh is ready."""
@@ -284,6 +288,11 @@ class _Show:
             **self._counts,
         }
 
+    def _time_to_first_body_s(self) -> float | None:
+        """From the very first skeleton's arrival to the first mesh shown."""
+        begin_ns, end_ns = self._channels.first_skeleton_ns, self._state.first_body_ns
+        return None if begin_ns is None or end_ns is None else (end_ns - begin_ns) / 1e9
+
     def figures(self) -> dict[str, Any]:
         """Everything worth keeping of the run."""
         rendered = self.viewer.frames_rendered if isinstance(self.viewer, HeadlessScreen) else None
@@ -292,6 +301,7 @@ class _Show:
             "skeletons_received": self._channels.skeletons.counts["accepted"],
             "frames_shown": self._state.frames_shown,
             "frames_rendered": self._state.frames_shown if rendered is None else rendered,
+            "time_to_first_body_s": self._time_to_first_body_s(),
             "repository_poses": self._state.repository_poses,
             "skeleton_bytes": self._channels.subscribers["skeleton"].arrived_bytes if self._channels.subscribers else 0,
             "bulk_bytes": self._channels.subscribers["bulk"].arrived_bytes if self._channels.subscribers else 0,

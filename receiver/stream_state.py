@@ -20,6 +20,7 @@ class StreamState:
         self.frame: ShownFrame | None = None
         self.frames_shown = 0
         self.repository_poses = 0
+        self.first_body_ns: int | None = None  # when the first mesh was shown
         self._clock = clock
         self._sender_present = False
         self._skeleton_ns: int | None = None
@@ -40,6 +41,8 @@ class StreamState:
         self.frame = frame
         self.frames_shown += 1
         self.repository_poses = repository_poses
+        if self.first_body_ns is None and frame.pose_id is not None:
+            self.first_body_ns = self._clock.now_ns()
 
     @property
     def receiving(self) -> bool:

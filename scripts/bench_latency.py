@@ -55,6 +55,7 @@ def running(here: Site, seconds: float) -> list[Row]:
     rows = [
         row("running", "skeletons_per_second", _rate(sent), "1/s"),
         row("running", "skeleton_bytes_max", float(sent["skeleton_bytes_max"]), "bytes", 250, "DISPOSE §7"),
+        row("running", "time_to_first_body_s", received["time_to_first_body_s"], "s"),
         row("running", "exit_s_max", max(s for _, s in exits), "s"),
         row("running", "sender_cpu", float(sent["cpu_share"]), "cores"),
         row("running", "receiver_cpu", float(received["cpu_share"]), "cores"),
@@ -80,13 +81,14 @@ def comings_and_goings(here: Site) -> list[Row]:
     receiver = here.receiver()
     receiver.wait_for(POSES, 1)
     sender.wait_for(PUBLISHED, 120)  # the body is kept by then
-    late, receiver_back, sender_back, leaving = [], [], [], []
+    late, first_body, receiver_back, sender_back, leaving = [], [], [], [], []
     for number in range(REPETITIONS):
         say(f"comings and goings {number + 1}/{REPETITIONS}")
         begin = time.monotonic()
         second = here.receiver(name=f"late{number}")
         late.append(_until_person(second, begin))
         leaving.append(second.end()[1])
+        first_body.append(here.figures(f"late{number}")["time_to_first_body_s"])
         receiver.end(signal.SIGKILL)
         begin = time.monotonic()
         receiver = here.receiver(name=f"again{number}")
@@ -101,6 +103,7 @@ def comings_and_goings(here: Site) -> list[Row]:
         sender.wait_for(PUBLISHED, 120)
     return [
         row("late receiver", "start_to_person_s", median(late), "s"),
+        row("late receiver", "time_to_first_body_s", median(first_body), "s"),
         row("receiver killed", "restart_to_person_s", median(receiver_back), "s"),
         row("sender killed", "restart_to_moving_s", median(sender_back), "s"),
         row("receiver", "exit_s", median(leaving), "s"),

@@ -60,6 +60,7 @@ def parse_arguments() -> argparse.Namespace:
     parser.add_argument("--data", type=Path, metavar="DIR", help="folder with bodies/ and mocap/")
     parser.add_argument("--recording", type=Path, metavar="DIR", help="play a recording instead of the virtual rig")
     parser.add_argument("--cameras", type=int, default=4, metavar="N", help="cameras of the virtual rig (default 4)")
+    parser.add_argument("--self-view", action="store_true", help="the sender's own page too")
     parser.add_argument("--port", type=int, default=8080, help="port of the page (default 8080, or a free one)")
     options = parser.parse_args()
     if options.report and options.recording:
@@ -67,6 +68,7 @@ def parse_arguments() -> argparse.Namespace:
     if options.report and options.seconds is None:
         options.seconds = 30.0
     options.zenoh_port = free_port()
+    options.self_view_port = free_port()
     options.port = options.port if port_is_free(options.port) else free_port()
     return options
 
@@ -89,6 +91,7 @@ def start_daemons(options: argparse.Namespace, run: Path) -> dict[str, subproces
         send += ["--recording", str(options.recording), *([] if options.headless else ["--loop"])]
     else:
         send += ["--body", options.body, "--cameras", str(options.cameras)]
+    send += ["--self-view", "--self-view-port", str(options.self_view_port)] if options.self_view else []
     send += ["--motion", options.motion] if options.motion else []
     send += ["--data", str(options.data)] if options.data else []
     receive = [str(BIN / "telepose-receive"), "-e", link, "--http-port", str(options.port)]
@@ -117,6 +120,8 @@ def wait_until_ready(daemons: dict[str, subprocess.Popen[bytes]], run: Path) -> 
 def announce(options: argparse.Namespace) -> None:
     if not options.headless:
         print(f"\n  Open  http://127.0.0.1:{options.port}/  to see the person. Ctrl-C ends the demo.\n", flush=True)
+    if options.self_view:
+        print(f"  Open  http://127.0.0.1:{options.self_view_port}/  for what the sender sees of itself.\n", flush=True)
 
 
 def watch(daemons: dict[str, subprocess.Popen[bytes]], seconds: float | None) -> None:

@@ -82,6 +82,7 @@ def demo_report(run: Path, body: str, motion: str | None, data: Path | None) -> 
         "skeleton_bytes_max": sent["skeleton_bytes_max"],
         "skeletons_received": received["skeletons_received"],
         "frames_rendered": received["frames_rendered"],
+        "time_to_first_body_s": received["time_to_first_body_s"],
         "pose_age_ms": percentiles(ages, 50, 95, 99),
         "compute_latency_ms": percentiles([f[3] / 1e6 for f in session.frames if f[1] is not None], 50, 99),
         "candidate_poses_sent": sent["candidate_poses_sent"],

@@ -15,6 +15,7 @@ from sender.config import SenderSettings
 EXAMPLES = """examples:
   telepose-send                                       the built-in performer before four virtual cameras
   telepose-send -l tcp/0.0.0.0:7447                   the same, for receivers on other hosts
+  telepose-send --self-view                           and a page of one's own: http://127.0.0.1:8081/
   telepose-send --recording DIR                       a recording (its format: docs/recordings.md)
   telepose-send --data DIR --body NAME --motion ID    a body and a motion clip of your own
 """
@@ -44,6 +45,13 @@ def parse_arguments(arguments: list[str] | None = None) -> argparse.Namespace:
     )
     capture.add_argument(
         "--state", dest="state_folder", type=Path, metavar="DIR", help="where the body found is kept for a restart"
+    )
+    own = parser.add_argument_group("self view")
+    own.add_argument(
+        "--self-view", dest="self_view.enabled", action="store_true", default=None, help="show this person here too"
+    )
+    own.add_argument(
+        "--self-view-port", dest="self_view.port", type=int, metavar="PORT", help="of its page (default 8081)"
     )
     parser.add_argument(
         "--tracker", dest="tracking.tracker", metavar="NAME", help="gauss-newton (default), articp or particles"

@@ -90,6 +90,18 @@ class CandidateSettings:
 
 
 @dataclass(frozen=True, slots=True)
+class SelfViewSettings:
+    """The sender's own person on a page of this host (DISPOSE §8). ``port``: of the page, on loopback."""
+
+    enabled: bool = False
+    port: int = 8081
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.port <= 65535:
+            raise ValueError(f"port: {self.port} is outside 1..65535")
+
+
+@dataclass(frozen=True, slots=True)
 class SenderSettings:
     """``site`` and ``person`` name the stream. ``state_folder`` keeps the body found, so that a restarted sender goes
     on in mid-motion (None: the user's state folder). ``stats_file``: figures written at the end, as JSON."""
@@ -102,8 +114,13 @@ class SenderSettings:
     capture: CaptureSettings = field(default_factory=CaptureSettings)
     tracking: TrackingSettings = field(default_factory=TrackingSettings)
     poses: CandidateSettings = field(default_factory=CandidateSettings)
+    self_view: SelfViewSettings = field(default_factory=SelfViewSettings)
     http: MetricsSettings = field(default_factory=lambda: MetricsSettings(port=9101))
 
     def __post_init__(self) -> None:
         if not 0 <= self.person <= 255:
             raise ValueError(f"person: {self.person} is outside 0..255")
+        if self.self_view.enabled and self.link.mode == "client":
+            raise ValueError("self_view: needs a link of its own, which [link] mode = 'client' cannot have")
+        if self.self_view.enabled and self.link.config_file and not self.link.listen:
+            raise ValueError("self_view: name what Zenoh's own file listens on in [link] listen, too")

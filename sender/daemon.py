@@ -37,6 +37,7 @@ from sender.pipeline import CandidatePath, Candidates, SkeletonPath, StreamIdent
 from sender.receiver_links import ReceiverLinks
 from sender.reconstruction.person_points import DepthReconstruction, HullReconstruction
 from sender.rehearsal import rehearse_all, rehearse_candidates
+from sender.self_view import SelfView, open_self_view
 
 log = logging.getLogger(__name__)
 
@@ -62,17 +63,20 @@ class SenderDaemon:
         settings = self._settings
         store = BodyStore(settings.state_folder, settings.site, settings.person)
         body = store.load()
-        async with open_session(with_endpoints(settings.link, "sender")) as session:
-            try:
-                source = await self._open_source(body)
+        link = with_endpoints(settings.link, "sender")
+        with open_self_view(settings.self_view, settings.site, settings.person, link) as self_view:
+            link = link if self_view is None else self_view.with_private_link(link)
+            async with open_session(link) as session:
                 try:
-                    await self._run_with(source, session, store, body, daemon)
-                finally:
-                    await asyncio.to_thread(source.close)
-            except CaptureError as error:
-                raise DaemonError(str(error)) from error
-            except OpenClUnavailable as error:
-                raise DaemonError(f'[tracking] weights = "opencl": {error}') from error
+                    source = await self._open_source(body)
+                    try:
+                        await self._run_with(source, session, store, body, daemon, self_view)
+                    finally:
+                        await asyncio.to_thread(source.close)
+                except CaptureError as error:
+                    raise DaemonError(str(error)) from error
+                except OpenClUnavailable as error:
+                    raise DaemonError(f'[tracking] weights = "opencl": {error}') from error
 
     async def _open_source(self, body: BodyModel | None) -> FrameSource:
         """Open the cameras, and rehearse meanwhile: the first frames are worth as much as any.
@@ -86,9 +90,15 @@ class SenderDaemon:
         return source
 
     async def _run_with(
-        self, source: FrameSource, session: ZenohSession, store: BodyStore, body: BodyModel | None, daemon: Daemon
+        self,
+        source: FrameSource,
+        session: ZenohSession,
+        store: BodyStore,
+        body: BodyModel | None,
+        daemon: Daemon,
+        self_view: SelfView | None,
     ) -> None:
-        stream = _Stream(self._settings, source, session, store, body, self._clock, self._health)
+        stream = _Stream(self._settings, source, session, store, body, self._clock, self._health, self_view)
         app = daemon_app(stream.metrics, self._health)
         http = self._settings.http
         try:
@@ -114,12 +124,14 @@ class _Stream:
         body: BodyModel | None,
         clock: MonotonicClock,
         health: Health,
+        self_view: SelfView | None,
     ) -> None:
         self._settings = settings
         self._source = source
         self._store = store
         self._clock = clock
         self._health = health
+        self._self_view = self_view
         self._timer = StageTimer(clock)
         self._statistics = RunStatistics(self._timer)
         identity = StreamIdentity(settings.person, secrets.randbits(32))
@@ -177,6 +189,8 @@ class _Stream:
             await asyncio.gather(self._fitting.wait_ready(), self._meshing.wait_ready())
             self._health.ready, self._health.reason = True, "capturing"
             daemon.announce_ready()
+            if self._self_view is not None:
+                lasting.append(group.create_task(self._self_view.run()))
             await self._capture.run()
             await asyncio.sleep(LAST_WORDS_S)
             for task in lasting:
@@ -221,7 +235,9 @@ class _Stream:
     def _on_sent(self, record: SendRecord) -> None:
         """On the loop: a pose is on its way to a receiver."""
         self._poses_sent += 1
-        self._candidates.note_sent(record.pose_id, record.retain_threshold)
+        # The self view's link has no bandwidth worth a thought: what goes there must not thin out what others get.
+        if self._self_view is None or record.receiver_id != self._self_view.name:
+            self._candidates.note_sent(record.pose_id, record.retain_threshold)
         log.debug("send %s", record)
 
     def _tell_status(self) -> None:

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import copy
+import os
 import signal
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 from receiver.show_log import read_show_log
-from scripts.daemon_processes import Site, site
+from scripts.daemon_processes import Running, Site, free_port, site
 
 SHOWN, PUBLISHED = "telepose_frames_shown_total", "telepose_skeletons_published_total"
 POSES = "telepose_repository_poses"
@@ -37,6 +40,7 @@ def test_a_person_gets_through_and_both_ends_leave_cleanly(here):
         assert code == 0, daemon.log
         assert seconds < 2.5
     assert here.figures("sender")["skeleton_bytes_max"] <= 250
+    assert 0 < here.figures("receiver")["time_to_first_body_s"] < 30
     assert 'site = "studio"' in here.figures("receiver")["settings"]
     kinds = {kind for kind, _, _ in read_show_log(log)}
     assert kinds == {"skeleton", "body", "pose", "frame", "tick"}
@@ -84,3 +88,49 @@ def test_a_recording_that_is_not_there_is_an_error_in_one_line(here):
     assert sender.process.wait(30) == 1
     assert "nowhere" in sender.log.strip().splitlines()[-1]
     assert "Traceback" not in sender.log
+
+
+def test_the_self_view_shows_the_person_comes_back_and_leaves_with_its_sender(here):
+    here.rig(*SMALL_RIG)
+    sender, page = with_self_view(here)
+    page.wait_for(SHOWN, 10)
+    assert "<title>telepose</title>" in page.get("/")[1]
+    first = own_receiver(sender)
+    os.kill(first, signal.SIGKILL)
+    while page.get("/healthz")[0] == 200:
+        time.sleep(0.02)
+    page.wait_for(POSES, 1)
+    second = own_receiver(sender)
+    assert second != first
+    sender.end(signal.SIGKILL)
+    deadline = time.monotonic() + 5
+    while os.path.exists(f"/proc/{second}"):
+        assert time.monotonic() < deadline, "the self view outlived its sender"
+        time.sleep(0.02)
+
+
+def test_a_stopped_sender_ends_its_self_view_in_time(here):
+    here.rig(*SMALL_RIG)
+    sender, _ = with_self_view(here)
+    receiver = own_receiver(sender)
+    code, seconds = sender.end()
+    assert (code, seconds < 2.5) == (0, True), sender.log
+    assert not os.path.exists(f"/proc/{receiver}")
+
+
+def with_self_view(here: Site) -> tuple[Running, Running]:
+    """A sender, and the same as seen through the page of its self view, which shows a person."""
+    port = free_port()
+    sender = here.sender("--self-view", "--self-view-port", str(port))
+    page = copy.copy(sender)
+    page.http_port = port
+    page.wait_for(POSES, 1)
+    return sender, page
+
+
+def own_receiver(sender: Running) -> int:
+    """The process of the receiver that the sender has started."""
+    children = Path(f"/proc/{sender.process.pid}/task").glob("*/children")
+    started = [int(child) for file in children for child in file.read_text().split()]
+    (receiver,) = [child for child in started if b"telepose-receive" in Path(f"/proc/{child}/cmdline").read_bytes()]
+    return receiver

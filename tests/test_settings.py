@@ -49,6 +49,9 @@ def test_every_commented_key_of_the_example_exists(settings, name, tmp_path):
         ("[poses]\njpeg_quality = 5", "jpeg_quality: 5"),
         ("[poses]\nregion_weights = { tumb = 1 }", r"\[poses\] region_weights: no region 'tumb'"),
         ("[poses]\nregion_weights = { thumb = -1 }", "thumb = -1.* is outside"),
+        ("[self_view]\nport = 0", r"\[self_view\] port: 0 is outside"),
+        ('[link]\nmode = "client"\n[self_view]\nenabled = true', "self_view: needs a link of its own"),
+        ('[link]\nconfig_file = "z.json5"\n[self_view]\nenabled = true', "self_view: name what Zenoh's own file"),
     ],
 )
 def test_a_mistake_is_named(toml, message, tmp_path):
@@ -56,6 +59,12 @@ def test_a_mistake_is_named(toml, message, tmp_path):
     file.write_text(toml)
     with pytest.raises(SettingsError, match=message):
         load_settings(SenderSettings, file)
+
+
+def test_a_headless_receiver_has_no_window():
+    options = receive_cli.parse_arguments(["--headless", "--window"])
+    with pytest.raises(SettingsError, match=r"\[view\] window: a headless receiver has none"):
+        load_settings(ReceiverSettings, None, overrides(options))
 
 
 def test_the_command_line_goes_over_the_file(tmp_path):

@@ -33,6 +33,17 @@ def test_distortion_is_told_for_the_regions_seen_of_the_pose_on_screen():
     assert state.region_sigma == {}
 
 
+def test_first_sight_is_that_of_the_first_mesh_not_of_joints():
+    clock = ManualClock()
+    state = StreamState(clock)
+    state.shown(frame(None), 0)
+    assert state.first_body_ns is None
+    for _ in range(2):
+        clock.advance(FRAME_NS)
+        state.shown(frame(7), 1)
+    assert state.first_body_ns == clock.now_ns() - FRAME_NS
+
+
 def test_before_anything_came_it_waits():
     state = StreamState(ManualClock())
     status = state.status(None, 0, 0)
