@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Literal
 
 from common.body.body_regions import DEFAULT_WEIGHTS, region_weights
-from common.body.rigged_mesh import ScoreForm
+from common.body.joint_edges import ScoreForm
 from common.runtime.metrics import MetricsSettings
 from common.transport.zenoh_session import LinkSettings
 

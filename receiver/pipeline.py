@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 
 from common.body.body_regions import region_weights
 from common.body.distortion_score import region_scores
-from common.body.rigged_mesh import RiggedMesh, ScoreForm, build_rigged_mesh
+from common.body.joint_edges import ScoreForm
+from common.body.rigged_mesh import RiggedMesh, build_rigged_mesh
 from common.body.skeleton import Skeleton
 from common.body.skeleton_pose import forward_kinematics
 from common.body.skinning import link_motion
@@ -79,7 +80,8 @@ def mesh_of(message: bytes, person: int, score_form: ScoreForm = "joining-edges"
             candidate.skeleton,
             candidate.pose,
             candidate.views,
-            score_form=score_form,
+            candidate.rigging,
+            score_form,
         )
     except ValueError as error:
         raise WireError(str(error)) from error

@@ -7,7 +7,8 @@ from pathlib import Path
 from typing import Literal
 
 from common.body.body_regions import DEFAULT_WEIGHTS, region_weights
-from common.body.rigged_mesh import ScoreForm
+from common.body.joint_edges import ScoreForm
+from common.body.rigging import Segmentation
 from common.runtime.metrics import MetricsSettings
 from common.transport.zenoh_session import LinkSettings
 
@@ -66,7 +67,8 @@ class TrackingSettings:
 @dataclass(frozen=True, slots=True)
 class CandidateSettings:
     """Candidate poses. ``interval_ms``: time between two that are considered. ``least_confidence``: of a fit, for its
-    frame to become one. ``jpeg_quality``, ``depth_step_mm``: how finely a view is sent. ``region_weights``: ω where it
+    frame to become one. ``jpeg_quality``, ``depth_step_mm``: how finely a view is sent. ``segmentation``: what
+    belongs to which link. ``region_weights``: ω where it
     is not the default; ``score_form``: what σ divides by."""
 
     enabled: bool = True
@@ -74,6 +76,7 @@ class CandidateSettings:
     least_confidence: float = 0.5
     jpeg_quality: int = 85
     depth_step_mm: int = 2
+    segmentation: Segmentation = "voronoi"
     region_weights: dict[str, float] = field(default_factory=lambda: dict(DEFAULT_WEIGHTS))
     score_form: ScoreForm = "joining-edges"
 

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from common.body.body_regions import region_weights
 from common.body.rigged_mesh import build_rigged_mesh
+from common.body.rigging import Rigging
 from common.body.skeleton import Skeleton
 from common.body.skeleton_pose import SkeletonPose, forward_kinematics
 from common.body.view import View
@@ -209,7 +210,8 @@ class CandidatePath:
                 candidate.skeleton,
                 candidate.pose,
                 candidate.views,
-                score_form=self._settings.score_form,
+                candidate.rigging,
+                self._settings.score_form,
             )
         with self._timer.stage("usable poses"):
             while self._sent:
@@ -233,6 +235,7 @@ class CandidatePath:
             skeleton=tracked.skeleton,
             pose=tracked.fit.pose,  # not the quantised one: rounding twice could end elsewhere than the packet's
             views=tracked.views,
+            rigging=Rigging(settings.segmentation),
         )
         return encode_candidate_pose(candidate, settings.jpeg_quality, settings.depth_step_mm)
 

@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from common.body.body_regions import vertex_regions
-from common.body.rigged_mesh import RiggedMesh, joint_edges
+from common.body.joint_edges import joint_edges
+from common.body.rigged_mesh import RiggedMesh
 from common.body.skeleton import LINK_COUNT, LINK_INDEX, Skeleton, human_skeleton
 from common.body.skeleton_pose import SkeletonPose, bone_segments, forward_kinematics, joint_positions, rest_pose
 from common.body.skinning import link_motion

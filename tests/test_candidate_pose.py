@@ -11,6 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from common.body.rigging import Rigging, Segmentation
 from common.body.skeleton import LINK_COUNT, human_skeleton
 from common.body.skeleton_pose import SkeletonPose, rest_pose
 from common.body.view import View
@@ -31,8 +32,8 @@ from common.wire.skeleton_packet import SkeletonPacket, decode_skeleton, encode_
 from common.wire.view_codec import encode_view
 
 GOLDEN = Path(__file__).parent / "golden" / "candidate_pose.hex"
-FIXED_BYTES = 19 + 322 + 155
-VIEW_COUNT_AT, SKELETON_AT, POSE_AT = 18, 19, 19 + 322
+FIXED_BYTES = 20 + 322 + 155
+RIGGING_AT, VIEW_COUNT_AT, SKELETON_AT, POSE_AT = 18, 19, 20, 20 + 322
 
 
 def some_view(index: int = 0, height: int = 16, width: int = 24) -> View:
@@ -81,6 +82,12 @@ def test_its_skeleton_and_pose_are_those_of_body_message_and_skeleton_packet() -
     body = quantized_skeleton(CANDIDATE.skeleton)
     for field in ("offsets", "tips", "radii"):
         np.testing.assert_array_equal(getattr(decoded.skeleton, field), getattr(body, field))
+
+
+@pytest.mark.parametrize("segmentation", ["voronoi", "region-growing"])
+def test_how_it_is_rigged_comes_with_it(segmentation: Segmentation) -> None:
+    sent = replace(CANDIDATE, rigging=Rigging(segmentation))
+    assert decode_candidate_pose(encode_candidate_pose(sent)).rigging == sent.rigging
 
 
 def test_settings_reach_the_views() -> None:
@@ -155,6 +162,7 @@ def test_bytes_after_the_last_view_are_refused() -> None:
     [
         (0, b"\x31", "version byte 0x31"),
         (10, struct.pack("<q", -5), "capture time"),
+        *((RIGGING_AT, bytes([1 << bit]), "rigging") for bit in range(1, 8)),
         (SKELETON_AT + 12, b"\0\0", "radius"),
         (POSE_AT, b"\xff" * 155, "rotation|padding"),
         (FIXED_BYTES + 4, b"\x41", "version byte 0x41"),
@@ -210,6 +218,7 @@ def test_several_changed_bytes_are_refused_or_another_sound_candidate(changes: l
 def test_the_golden_candidate_decodes_to_known_values() -> None:
     decoded = decode_candidate_pose(bytes.fromhex(GOLDEN.read_text()))
     assert (decoded.pose_id, decoded.person, decoded.epoch, decoded.capture_ns) == (9, 1, 2, 3_000_000_000)
+    assert decoded.rigging == Rigging("region-growing")
     np.testing.assert_allclose(decoded.skeleton.offsets[6], [0.1584, -0.0144, 0], atol=1e-6)  # left upper arm, 1.8 m
     np.testing.assert_allclose(decoded.pose.root_position, [0.5, 0.95, -0.25], atol=1e-7)
     np.testing.assert_array_equal(decoded.pose.rotations, np.tile([1, 0, 0, 0], (LINK_COUNT, 1)))

@@ -22,7 +22,8 @@ from common.body.distortion_score import (
     distortion_scores,
     region_scores,
 )
-from common.body.rigged_mesh import RiggedMesh, joint_edges
+from common.body.joint_edges import joint_edges
+from common.body.rigged_mesh import RiggedMesh
 from common.body.skeleton_pose import SkeletonPose
 from common.body.skinning import animate, link_motion
 from tests.capsule_person import SKELETON

@@ -7,13 +7,12 @@ import pytest
 
 from common.body.body_regions import REGION_INDEX, REGION_LINKS, vertex_regions
 from common.body.depth_mesher import mesh_view
+from common.body.joint_edges import FIXED_EDGE_M, joint_edges
 from common.body.rigged_mesh import (
     DRAWN_EDGE_M,
     DRAWN_LINK_STEPS,
-    FIXED_EDGE_M,
     MESH_STRIDE,
     build_rigged_mesh,
-    joint_edges,
 )
 from common.body.skeleton import LINK_COUNT, LINK_INDEX, LINK_PARENTS
 from common.body.skinning import animate, link_motion

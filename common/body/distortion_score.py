@@ -11,7 +11,8 @@ from numba import njit
 from numpy.typing import NDArray
 
 from common.body.body_regions import REGION_COUNT
-from common.body.rigged_mesh import JointEdges, RiggedMesh
+from common.body.joint_edges import JointEdges
+from common.body.rigged_mesh import RiggedMesh
 
 START_THRESHOLD = 0.15  # DISPOSE §7.1; its edges are coarser than ours, so the session corrects it at once
 

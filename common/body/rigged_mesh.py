@@ -7,15 +7,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from common.body.body_regions import REGION_COUNT, REGION_LINKS, vertex_regions
+from common.body.body_regions import vertex_regions
 from common.body.depth_mesher import mesh_view
+from common.body.joint_edges import JointEdges, ScoreForm, joint_edges
 from common.body.link_segmentation import nearest_link
+from common.body.region_growing import grown_regions
+from common.body.rigging import DEFAULT_RIGGING, Rigging
 from common.body.skeleton import LINK_COUNT, LINK_PARENTS, Skeleton
 from common.body.skeleton_pose import SkeletonPose, forward_kinematics
 from common.body.vertex_blend import VertexBlend, vertex_blend
@@ -41,38 +43,6 @@ def _link_steps() -> NDArray[np.int64]:
 
 
 _LINK_STEPS = _link_steps()
-
-
-# What Eq. (1) divides the change of a region's edges by: their own length, as printed; that of all the region's edges,
-# those within it too; or their number times a fixed length. The first grows as edges get shorter, and the paper's
-# threshold of 0.15 belongs to it on meshes like the paper's; the last means the same on coarse meshes and fine ones.
-ScoreForm = Literal["joining-edges", "all-edges", "fixed-length"]
-FIXED_EDGE_M = 0.05
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class JointEdges:
-    """The E edges whose ends lie on different links, grouped by region pair (P pairs): all that σ needs of a mesh.
-
-    ``vertices`` (E, 2) int32: the ends, in the pair's lower and higher region.
-    ``points`` (6, E) float32 [m]: x y z of the lower region's end in its link's frame, then of the higher region's.
-    ``rest_lengths`` (E,) float32 [m] at capture.
-    ``pair_regions`` (P, 2) uint8, ``pair_links`` (P, 2) uint8: the links those move with; edges
-    ``pair_starts[p]:pair_starts[p + 1]`` join pair p, ``pair_starts`` (P+1,) int32.
-    ``region_lengths`` (R,) float32 [m]: what Eq. (1) divides by, Σ len(e) of each region, an edge counting in both its
-    regions; 0 for a region that no edge joins to another link.
-    """
-
-    vertices: NDArray[np.int32]
-    points: NDArray[np.float32]
-    rest_lengths: NDArray[np.float32]
-    pair_regions: NDArray[np.uint8]
-    pair_links: NDArray[np.uint8]
-    pair_starts: NDArray[np.int32]
-    region_lengths: NDArray[np.float32]
-
-    def __len__(self) -> int:
-        return len(self.rest_lengths)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -121,21 +91,28 @@ def build_rigged_mesh(
     skeleton: Skeleton,
     pose: SkeletonPose,
     views: Sequence[View],
+    rigging: Rigging = DEFAULT_RIGGING,
     score_form: ScoreForm = "joining-edges",
 ) -> RiggedMesh:
-    """Mesh all views of one instant and rig them to the skeleton of that instant; ``score_form`` of its σ.
+    """Mesh all views of one instant and rig them to the skeleton of that instant: how, both ends must agree on
+    (``rigging``); ``score_form`` of σ is each end's own.
 
     Raises:
         ValueError: the views hold no triangle that can be drawn.
     """
     if not views:
         raise ValueError(f"pose {pose_id}: no views")
-    mesh = _merged([mesh_view(view, MESH_STRIDE) for view in views])
+    meshes = [mesh_view(view, MESH_STRIDE) for view in views]
+    mesh = _merged(meshes)
     if len(mesh.faces) == 0:
         raise ValueError(f"pose {pose_id}: its {len(views)} views hold no surface")
     T_world_link = forward_kinematics(skeleton, pose)
     T_link_world = inverse(T_world_link.astype(np.float64)).astype(np.float64)
-    vertex_link = nearest_link(mesh.vertices, skeleton, T_world_link)
+    if rigging.segmentation == "region-growing":
+        grown = [grown_regions(v, m, MESH_STRIDE, skeleton, T_world_link) for v, m in zip(views, meshes, strict=True)]
+        vertex_link = np.concatenate(grown)
+    else:
+        vertex_link = nearest_link(mesh.vertices, skeleton, T_world_link)
     mesh, drawn_count = _drawn_first(mesh, vertex_link)
     if drawn_count == 0:
         raise ValueError(f"pose {pose_id}: nothing of its {len(mesh.faces)} triangles can be drawn")
@@ -144,57 +121,6 @@ def build_rigged_mesh(
     blend = vertex_blend(mesh.vertices, vertex_link, skeleton, T_world_link)
     drawn = mesh.faces[:drawn_count]
     return RiggedMesh(pose_id, capture_ns, skeleton, pose, T_link_world, mesh, vertex_link, blend, drawn, edges)
-
-
-def joint_edges(
-    mesh: TriangleMesh,
-    vertex_region: NDArray[np.uint8],
-    T_link_world: NDArray[np.float64],
-    score_form: ScoreForm = "joining-edges",
-) -> JointEdges:
-    """Collect the edges between links, each once, sorted by region pair.
-
-    ``vertex_region`` (V,) uint8 (``vertex_regions``), ``T_link_world`` (L, 4, 4): as in ``RiggedMesh``.
-    """
-    count = len(mesh.vertices)
-    keys = np.unique(_joining_edge_keys(mesh.faces, vertex_region, REGION_LINKS))
-    pair, ends = np.divmod(keys, count * count)
-    vertices = np.stack(np.divmod(ends, count), axis=1).astype(np.int32)
-    starts = np.flatnonzero(np.diff(pair, prepend=-1))
-    regions = np.stack(np.divmod(pair, REGION_COUNT), axis=1).astype(np.uint8)
-    links = REGION_LINKS[regions]
-    a, b = (
-        np.einsum("eij,ej->ei", T_link_world[links[:, k], :3, :3], mesh.vertices[vertices[:, k]])
-        + T_link_world[links[:, k], :3, 3]
-        for k in (0, 1)
-    )
-    lengths = np.linalg.norm(mesh.vertices[vertices[:, 0]] - mesh.vertices[vertices[:, 1]], axis=1)
-    return JointEdges(
-        vertices=vertices,
-        points=np.ascontiguousarray(np.concatenate([a, b], axis=1).T, np.float32),
-        rest_lengths=lengths.astype(np.float32),
-        pair_regions=np.ascontiguousarray(regions[starts]),
-        pair_links=np.ascontiguousarray(links[starts]),
-        pair_starts=np.append(starts, len(keys)).astype(np.int32),
-        region_lengths=_region_lengths(mesh, vertex_region, regions, lengths, score_form),
-    )
-
-
-def _region_lengths(
-    mesh: TriangleMesh,
-    vertex_region: NDArray[np.uint8],
-    edge_regions: NDArray[np.uint8],
-    lengths: NDArray[np.floating],
-    score_form: ScoreForm,
-) -> NDArray[np.float32]:
-    """``JointEdges.region_lengths``, for edges (E,) of lengths [m] in regions (E, 2)."""
-    if score_form == "fixed-length":
-        lengths = np.full(len(lengths), FIXED_EDGE_M)
-    total = sum(np.bincount(edge_regions[:, k], weights=lengths, minlength=REGION_COUNT) for k in (0, 1))
-    if score_form == "all-edges":
-        joined = np.asarray(total) > 0
-        total = np.where(joined, _all_edge_lengths(mesh.vertices, mesh.faces, vertex_region, REGION_COUNT), 0)
-    return np.asarray(total, np.float32)
 
 
 def _merged(meshes: Sequence[TriangleMesh]) -> TriangleMesh:
@@ -238,44 +164,3 @@ def _drawn(vertices, faces, vertex_link, linked, longest_squared):  # type: igno
             if x * x + y * y + z * z > longest_squared or not linked[vertex_link[a], vertex_link[b]]:
                 out[f] = False
     return out
-
-
-@njit(nogil=True, cache=True, error_model="numpy")
-def _joining_edge_keys(faces, vertex_region, region_links):  # type: ignore[no-untyped-def]
-    """Keys (E',) int64 of the edges between links, twice where two triangles share one: region pair, and the ends."""
-    vertex_count, region_count = np.int64(len(vertex_region)), np.int64(len(region_links))
-    keys = np.empty(3 * len(faces), np.int64)
-    count = 0
-    for f in range(len(faces)):
-        for k in range(3):
-            a, b = np.int64(faces[f, k]), np.int64(faces[f, (k + 1) % 3])
-            if region_links[vertex_region[a]] == region_links[vertex_region[b]]:
-                continue
-            if vertex_region[a] > vertex_region[b]:
-                a, b = b, a
-            pair = np.int64(vertex_region[a]) * region_count + np.int64(vertex_region[b])
-            keys[count] = (pair * vertex_count + a) * vertex_count + b
-            count += 1
-    return keys[:count].copy()
-
-
-@njit(nogil=True, cache=True, error_model="numpy")
-def _all_edge_lengths(vertices, faces, vertex_region, region_count):  # type: ignore[no-untyped-def]
-    """Σ len(e) (R,) [m] over the edges with an end in each region, each edge once."""
-    totals = np.zeros(region_count)
-    seen = set()
-    for f in range(len(faces)):
-        for k in range(3):
-            a, b = np.int64(faces[f, k]), np.int64(faces[f, (k + 1) % 3])
-            key = min(a, b) * len(vertices) + max(a, b)
-            if key in seen:
-                continue
-            seen.add(key)
-            x = vertices[a, 0] - vertices[b, 0]
-            y = vertices[a, 1] - vertices[b, 1]
-            z = vertices[a, 2] - vertices[b, 2]
-            length = np.sqrt(x * x + y * y + z * z)
-            totals[vertex_region[a]] += length
-            if vertex_region[a] != vertex_region[b]:
-                totals[vertex_region[b]] += length
-    return totals

@@ -3,7 +3,8 @@
 Both ends build the mesh from the *decoded* candidate, so the sender too decodes what it encoded:
 ``decode_candidate_pose(encode_candidate_pose(c))`` is the one candidate there is.
 Layout, little endian: header | skeleton sizes | pose | per view: length u32, view.
-header: version u8, person u8, epoch u32, pose id u32, capture time i64 [ns], number of views u8.
+header: version u8, person u8, epoch u32, pose id u32, capture time i64 [ns], rigging u8, number of views u8.
+rigging: bit 0 region growing instead of Voronoi cells; the other bits are 0.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ from __future__ import annotations
 import struct
 from dataclasses import dataclass
 
+from common.body.rigging import DEFAULT_RIGGING, Rigging
 from common.body.skeleton import Skeleton
 from common.body.skeleton_pose import SkeletonPose
 from common.body.view import View
@@ -23,15 +25,17 @@ CANDIDATE_POSE_MAX_BYTES = 1 << 22
 MAX_VIEWS = 16
 MAX_PIXELS = 2 * VIEW_MAX_PIXELS  # of all views together: bounds what a candidate can make a receiver allocate
 
-_HEADER = struct.Struct("<BBIIqB")
+_HEADER = struct.Struct("<BBIIqBB")
 _LENGTH = struct.Struct("<I")
+_REGION_GROWING = 1
 _FIXED_BYTES = _HEADER.size + SKELETON_BYTES + POSE_BYTES
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CandidatePose:
     """One captured frame: ``pose_id`` numbers the candidates of an ``epoch``; ``capture_ns`` is the sender's monotonic
-    clock [ns]; ``skeleton`` and ``pose`` are those fitted at that instant; ``views`` at least one, at most 16."""
+    clock [ns]; ``skeleton`` and ``pose`` are those fitted at that instant; ``views`` at least one, at most 16;
+    ``rigging``: how the mesh is built of them."""
 
     pose_id: int
     person: int
@@ -40,6 +44,7 @@ class CandidatePose:
     skeleton: Skeleton
     pose: SkeletonPose
     views: tuple[View, ...]
+    rigging: Rigging = DEFAULT_RIGGING
 
 
 def encode_candidate_pose(candidate: CandidatePose, jpeg_quality: int = JPEG_QUALITY, depth_step_mm: int = 1) -> bytes:
@@ -57,6 +62,7 @@ def encode_candidate_pose(candidate: CandidatePose, jpeg_quality: int = JPEG_QUA
             checked_int("epoch", candidate.epoch, 0, U32_MAX),
             checked_int("pose id", candidate.pose_id, 0, U32_MAX),
             checked_int("capture time", candidate.capture_ns, 0, TIME_MAX_NS),
+            _REGION_GROWING if candidate.rigging.segmentation == "region-growing" else 0,
             checked_int("number of views", len(candidate.views), 1, MAX_VIEWS),
         ),
         encode_skeleton_sizes(candidate.skeleton),
@@ -80,13 +86,20 @@ def decode_candidate_pose(data: bytes) -> CandidatePose:
     check_start("candidate pose", data, CANDIDATE_POSE_VERSION, CANDIDATE_POSE_MAX_BYTES)
     if len(data) < _FIXED_BYTES:
         raise WireError(f"candidate pose: {len(data)} bytes are fewer than its fixed part")
-    _, person, epoch, pose_id, capture_ns, view_count = _HEADER.unpack_from(data)
+    _, person, epoch, pose_id, capture_ns, flags, view_count = _HEADER.unpack_from(data)
     checked_int("capture time", capture_ns, 0, TIME_MAX_NS)
     checked_int("number of views", view_count, 1, MAX_VIEWS)
+    rigging = _decode_rigging(flags)
     skeleton = decode_skeleton_sizes(data[_HEADER.size : _HEADER.size + SKELETON_BYTES])
     pose = decode_pose(data[_HEADER.size + SKELETON_BYTES : _FIXED_BYTES])
     views = _decode_views(data, view_count)
-    return CandidatePose(pose_id, person, epoch, capture_ns, skeleton, pose, views)
+    return CandidatePose(pose_id, person, epoch, capture_ns, skeleton, pose, views, rigging)
+
+
+def _decode_rigging(flags: int) -> Rigging:
+    if flags & ~_REGION_GROWING:  # a mesh built otherwise than the sender's would be judged wrongly
+        raise WireError(f"candidate pose: rigging 0x{flags:02x} asks for what is not known here")
+    return Rigging("region-growing" if flags & _REGION_GROWING else "voronoi")
 
 
 def _decode_views(data: bytes, count: int) -> tuple[View, ...]:

@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 
 from common.body.body_regions import default_region_weights
 from common.body.distortion_score import SessionThreshold, distortion_scores
-from common.body.rigged_mesh import JointEdges, RiggedMesh
+from common.body.joint_edges import JointEdges
+from common.body.rigged_mesh import RiggedMesh
 from common.body.skeleton import LINK_COUNT
 from common.body.skeleton_pose import forward_kinematics
 
