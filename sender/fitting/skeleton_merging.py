@@ -1,12 +1,9 @@
 """Skeletons of several sensors merged by confidence into one (Yeung, Kwok & Wang 2013; DISPOSE §3).
 
-Each joint is the mean of what the sensors say, weighted by the inverse of a variance, and bones keep their lengths.
-The variance grows with what makes a sensor err: guessed joints, a person side-on to it or turned away, bones of a wrong
-length, a place far from where the past leads while another sensor's is near, noise of late, and data older than the
-others'. The past weighs sensors against each other and fills in what nobody sees; it does not slow the joints down.
-Sensors differ by centimetres all the time (calibration; the side they look at), so it is their motions that are
-averaged, each from where the joints are; a slow pull brings the joints to the mean of the places. Otherwise every
-change of weights would be a jump.
+A Kalman filter joins what the sensors say of each joint (``joint_filter``), and bones keep their lengths. A sensor's
+word is worth the inverse of a variance, which grows with what makes a sensor err: its noise of late, guessed joints, a
+person side-on to it or turned away, bones of a wrong length, a place far from where the past leads while another
+sensor's is near.
 """
 
 from __future__ import annotations
@@ -20,26 +17,22 @@ from numpy.typing import NDArray
 
 from sender.capture.outside_skeleton import JOINTS_BY_KIND, Instant, Sensor
 from sender.fitting.bone_lengths import RunningMedian, bones_of
+from sender.fitting.joint_filter import JointFilter
 
 Floats = NDArray[np.float64]
 
 NOISE_M = 0.002  # of a tracked joint, before anything is known of a sensor
 LEAST_NOISE_M = 0.001
 NOISE_RATE = 0.05  # of the running mean of the noise, per frame
-ACCELERATION_M_S2 = 7.0  # usual for limbs: what a place in the past is worth
-PULL_S = 0.5  # over which the joints come to the mean of the places
-DRIFT_M2_S = 1e-3  # variance per second of where a sensor places a joint
 DISAGREEMENT_M = 0.03
 BONE_ERROR_M = 0.03
 SIDE_ON = 0.25  # weight of a sensor that sees the person from the side or from behind
 EARLY_FRAMES = 64
 TRIAL_FRAMES = 256  # a person who comes in from the side is measured badly at first
 ANOTHER_PERSON = 0.12  # median difference of the bones' lengths
-VELOCITY_RATE = 0.6
 PAUSE_S = 0.3  # after so long the past does not say where the joints are
 ABSENCE_S = 2.0  # after so long it may be another person
 PROJECTIONS = 100
-PAST_M = 0.02  # what a place that the past leads to is worth at once
 UNSEEN_M = 0.1  # how well a joint is known that nobody sees
 SEEN = 0.5  # least confidence of a joint that sizes are learned from
 _TINY = 1e-12
@@ -78,48 +71,49 @@ def _keep_lengths(joints, share, bones, lengths, rounds):  # type: ignore[no-unt
 
 
 class _Witness:
-    """What is remembered of one sensor: its last two skeletons, its noise, and where it places the joints (J, 3) [m]
-    compared with the merged skeleton (``bias``)."""
+    """What is remembered of one sensor: its last two skeletons (NaN where it did not track a joint), its noise, and
+    which joints it tracks."""
 
     def __init__(self, joints: int) -> None:
         self.noise = np.full(joints, NOISE_M**2)  # variance per axis [m²]
-        self.bias = np.zeros((joints, 3))
         self.tracked = np.zeros(joints, np.bool_)
         self._times_ns = (0, 0)
         self._last: Floats | None = None
         self._before: Floats | None = None
 
-    def take(self, capture_ns: int, joints: Floats) -> None:
-        """A skeleton (J, 3) of this sensor; one that was taken before says nothing about its noise."""
+    def take(self, capture_ns: int, joints: Floats, tracked: NDArray[np.bool_]) -> bool:
+        """A skeleton (J, 3) of this sensor, of which it tracks some joints (J,); False for one that was taken before,
+        which says nothing new."""
         step_s, past_s = (capture_ns - self._times_ns[0]) * 1e-9, (self._times_ns[0] - self._times_ns[1]) * 1e-9
         if self._last is not None and step_s == 0:
-            return
+            return False
+        joints = np.where(tracked[:, None], joints, np.nan)
         goes_on = 0 < step_s < PAUSE_S
         if goes_on and self._last is not None and self._before is not None:
             ahead = step_s / past_s
             surprise = joints - self._last - ahead * (self._last - self._before)
             variance = (surprise**2).mean(axis=1) / (1 + (1 + ahead) ** 2 + ahead**2)
             variance = np.minimum(variance, 25 * self.noise)  # a jump is judged by the others, not by this
-            self.noise += NOISE_RATE * (np.maximum(variance, LEAST_NOISE_M**2) - self.noise)
+            change = np.maximum(variance, LEAST_NOISE_M**2) - self.noise
+            self.noise += NOISE_RATE * np.nan_to_num(change)  # not from places that it guessed
         self._before = self._last if goes_on else None
         self._last, self._times_ns = joints, (capture_ns, self._times_ns[0])
+        return True
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Words:
-    """What S sensors say at one instant. ``places`` (S, J, 3): brought to the instant by the joints' velocity;
-    ``age_s`` (S,): by how much."""
+    """What S sensors say at one instant. ``joints`` (S, J, 3) [m]; ``places`` (S, J, 3): brought to the instant by the
+    joints' velocity; ``age_s`` (S,): by how much; ``fresh``: who says something new."""
 
+    sensors: list[int]
     witnesses: tuple[_Witness, ...]
     positions: Floats  # of the sensors (S, 3)
+    joints: Floats
     places: Floats
     confidence: Floats
     age_s: Floats
-
-    @property
-    def staleness(self) -> Floats:
-        """Variance (S, 1) [m²] for what may have happened since."""
-        return np.asarray((0.5 * ACCELERATION_M_S2 * self.age_s[:, None] ** 2) ** 2)
+    fresh: tuple[bool, ...]
 
 
 class SkeletonMerger:
@@ -138,8 +132,7 @@ class SkeletonMerger:
         self._positions = np.array([sensor.position for sensor in sensors], np.float64).reshape(-1, 3)
         self._sides = tuple([names.index(f"{s}_{joint}") for joint in ("shoulder", "hip")] for s in ("left", "right"))
         self._witnesses = [_Witness(len(names)) for _ in sensors]
-        self._joints = np.full((len(names), 3), np.nan)
-        self._velocity = np.zeros((len(names), 3))
+        self._filter = JointFilter(len(names), len(sensors))
         self._capture_ns: int | None = None
 
     def merge(self, instant: Instant) -> MergedSkeleton:
@@ -149,21 +142,19 @@ class SkeletonMerger:
             ValueError: a skeleton of another kind, or of a sensor there is not.
         """
         for skeleton in instant:
-            if len(skeleton.joints) != len(self._joints) or not 0 <= skeleton.sensor < len(self._witnesses):
+            if len(skeleton.joints) != len(self._filter.places) or not 0 <= skeleton.sensor < len(self._witnesses):
                 raise ValueError(f"a {skeleton.kind} skeleton of sensor {skeleton.sensor} does not belong here")
         capture_ns = max(skeleton.capture_ns for skeleton in instant)
         passed_s = self._passed_s(capture_ns)
+        self._filter.advance(passed_s)
         words = self._words(instant, capture_ns)
-        led = self._joints + self._velocity * passed_s
-        self._welcome(words, led)
-        said = words.places - np.array([witness.bias for witness in words.witnesses])
-        variance = self._variance(words, said, led)
-        free = _mean(said, variance, led, passed_s)
-        self._hold_on(words, free, passed_s)
-        joints = self._with_bones_kept(free, variance, words)
+        self._welcome(words)
+        said = words.places - np.moveaxis(self._filter.offsets[:, words.sensors], 1, 0)
+        variance = self._variance(words, said)
+        self._take(words, variance, passed_s)
+        joints = self._with_bones_kept(variance, words)
         unseen = words.confidence.max(axis=0) == 0
-        remembered = joints if self._knows_lengths else np.where(unseen[:, None], joints, free)
-        self._move_on(remembered, unseen, capture_ns, passed_s)
+        self._move_on(joints, unseen, capture_ns)
         apart = np.linalg.norm(said - joints, axis=2)[words.confidence > SEEN]
         spread_m = float(np.sqrt((apart**2).mean())) if len(apart) else 0.0
         return MergedSkeleton(capture_ns, joints, words.confidence.max(axis=0), spread_m)
@@ -178,10 +169,9 @@ class SkeletonMerger:
         passed_s = np.inf if self._capture_ns is None else (capture_ns - self._capture_ns) * 1e-9
         if 0 <= passed_s < PAUSE_S:
             return float(passed_s)
-        self._joints = np.full_like(self._joints, np.nan)
-        self._velocity = np.zeros_like(self._velocity)
+        self._filter = JointFilter(len(self._filter.places), len(self._witnesses))
         for witness in self._witnesses:
-            witness.bias[:], witness.tracked[:] = 0.0, False
+            witness.tracked[:] = False
         if not 0 <= passed_s < ABSENCE_S and self._learned.count:
             self._stranger = RunningMedian(len(self.bones))
         return 0.0
@@ -190,33 +180,48 @@ class SkeletonMerger:
         sensors = [skeleton.sensor for skeleton in instant]
         joints = np.array([skeleton.joints for skeleton in instant], np.float64)
         age_s = np.array([capture_ns - skeleton.capture_ns for skeleton in instant]) * 1e-9
-        for skeleton, own in zip(instant, joints, strict=True):
-            self._witnesses[skeleton.sensor].take(skeleton.capture_ns, own)
+        confidence = np.array([skeleton.confidence for skeleton in instant], np.float64)
+        fresh = tuple(
+            self._witnesses[skeleton.sensor].take(skeleton.capture_ns, own, sure > 0)
+            for skeleton, own, sure in zip(instant, joints, confidence, strict=True)
+        )
         return _Words(
+            sensors=sensors,
             witnesses=tuple(self._witnesses[sensor] for sensor in sensors),
             positions=self._positions[sensors],
-            places=joints + self._velocity * np.minimum(age_s, PAUSE_S)[:, None, None],
-            confidence=np.array([skeleton.confidence for skeleton in instant], np.float64),
+            joints=joints,
+            places=joints + self._filter.velocity * np.minimum(age_s, PAUSE_S)[:, None, None],
+            confidence=confidence,
             age_s=age_s,
+            fresh=fresh,
         )
 
-    def _welcome(self, words: _Words, led: Floats) -> None:
+    def _welcome(self, words: _Words) -> None:
         """A joint that a sensor tracks again goes on from where it is led to by the others and the past."""
-        for witness, own, confidence in zip(words.witnesses, words.places, words.confidence, strict=True):
-            tracked = confidence > 0
-            again = tracked & ~witness.tracked
-            witness.bias[again] = np.nan_to_num(own - led)[again]
-            witness.tracked = tracked
+        for sensor, own, confidence in zip(words.sensors, words.places, words.confidence, strict=True):
+            witness = self._witnesses[sensor]
+            self._filter.welcome(sensor, own, (confidence > 0) & ~witness.tracked)
+            witness.tracked = confidence > 0
 
-    def _variance(self, words: _Words, said: Floats, led: Floats) -> Floats:
+    def _take(self, words: _Words, variance: Floats, passed_s: float) -> None:
+        """Take what is new into the joints, the oldest first."""
+        worth = np.full((len(self._filter.places), len(self._witnesses)), np.inf)
+        worth[:, words.sensors] = variance.T
+        self._filter.wander(passed_s, worth)
+        for s in np.argsort(-words.age_s, kind="stable"):
+            if words.fresh[s]:
+                self._filter.take(words.sensors[s], words.joints[s], min(float(words.age_s[s]), PAUSE_S), variance[s])
+
+    def _variance(self, words: _Words, said: Floats) -> Floats:
         """What each sensor's word for each joint is worth (S, J): a variance per axis [m²], infinite for what is not
         tracked."""
+        led = self._filter.places
         away = np.nan_to_num(np.linalg.norm(said - led, axis=2))
         least = np.where(words.confidence > 0, away, np.inf).min(axis=0)
         excess = np.maximum(away - np.minimum(least, away), 0.0)
         weight = words.confidence**2 * self._facing(words, led)[:, None] * self._length_trust(words.places)
         weight = weight / (1 + (excess / DISAGREEMENT_M) ** 2) ** 2
-        noise = np.array([witness.noise for witness in words.witnesses]) + words.staleness
+        noise = np.array([witness.noise for witness in words.witnesses])
         return np.where(weight > 0, noise / np.maximum(weight, _TINY), np.inf)
 
     def _facing(self, words: _Words, joints: Floats) -> Floats:
@@ -239,11 +244,11 @@ class SkeletonMerger:
             np.minimum.at(least, ends, np.nan_to_num(error, nan=np.inf).T)
         return np.asarray(1 / (1 + (np.where(np.isfinite(least), least, 0.0).T / BONE_ERROR_M) ** 2))
 
-    def _with_bones_kept(self, free: Floats, variance: Floats, words: _Words) -> Floats:
+    def _with_bones_kept(self, variance: Floats, words: _Words) -> Floats:
         """The joints (J, 3) with their bones at the lengths learned, from this frame as well."""
         self._learn(words)
+        joints = self._filter.places.copy()
         share = 1 / ((1 / variance).sum(axis=0) + 1 / UNSEEN_M**2)
-        joints = free.copy()
         _keep_lengths(joints, share, self.bones, self.lengths, PROJECTIONS)
         return joints
 
@@ -275,41 +280,9 @@ class SkeletonMerger:
             self.people += 1
         self._stranger = None
 
-    def _hold_on(self, words: _Words, joints: Floats, passed_s: float) -> None:
-        """From here on each sensor's motion counts, from where the joints are now, and slowly its place as well."""
-        noise = np.array([witness.noise for witness in words.witnesses])
-        trust = words.confidence * self._facing(words, joints)[:, None] / noise
-        total = trust.sum(axis=0)[:, None]
-        mean = (trust[..., None] * words.places).sum(axis=0) / np.maximum(total, _TINY)
-        pull = np.where(total > 0, min(passed_s / PULL_S, 1.0) * (mean - joints), 0.0)
-        for witness, own, stale in zip(words.witnesses, words.places, words.staleness, strict=True):
-            gain = _drift_gain(DRIFT_M2_S * passed_s, witness.noise + stale)
-            change = gain[:, None] * (own - joints - witness.bias) - pull
-            witness.bias += np.where(np.isfinite(change), change, 0.0)  # nothing is learned where nobody sees
-
-    def _move_on(self, joints: Floats, unseen: NDArray[np.bool_], capture_ns: int, passed_s: float) -> None:
-        if passed_s > 0:
-            velocity = np.nan_to_num((joints - self._joints) / passed_s)
-            self._velocity += VELOCITY_RATE * (velocity - self._velocity)
+    def _move_on(self, joints: Floats, unseen: NDArray[np.bool_], capture_ns: int) -> None:
+        self._filter.places[unseen] = joints[unseen]
         for parent, joint in self.bones:  # outwards: what nobody sees goes with its parent
             if unseen[joint]:
-                self._velocity[joint] = self._velocity[parent]
-        self._joints, self._capture_ns = joints, capture_ns
-
-
-def _drift_gain(drift: float, noise: Floats) -> Floats:
-    """Share (J,) of a difference that is taken for the sensor's own: the steady gain of a Kalman filter for a place
-    that drifts with variance ``drift`` a frame, seen with variance ``noise`` (J,)."""
-    known = (drift + np.sqrt(drift**2 + 4 * drift * noise)) / 2
-    return np.asarray(known / (known + noise))
-
-
-def _mean(said: Floats, variance: Floats, led: Floats, passed_s: float) -> Floats:
-    """The joints (J, 3): what the sensors say, and where nobody says anything, where the past leads; NaN of a joint
-    that nobody has seen."""
-    weight = 1 / variance
-    past = np.where(np.isfinite(led[:, 0]), 1 / (PAST_M + 0.5 * ACCELERATION_M_S2 * passed_s**2) ** 2, 0.0)
-    total = weight.sum(axis=0) + past
-    heard = np.where(weight[..., None] > 0, said, 0.0)  # who does not see a joint may say NaN
-    places = (weight[..., None] * heard).sum(axis=0) + past[:, None] * np.nan_to_num(led)
-    return np.where(total[:, None] > 0, places / np.maximum(total, _TINY)[:, None], np.nan)
+                self._filter.velocity[joint] = self._filter.velocity[parent]
+        self._capture_ns = capture_ns
