@@ -123,6 +123,7 @@ function meshOf({ boxMin, boxSize, positions, uv, skin, joints, indices }, share
   geometry.boundingSphere = new THREE.Sphere(); // else three.js reads every vertex, to sort one mesh
   const material = new THREE.ShaderMaterial({
     glslVersion: THREE.GLSL3,
+    side: THREE.DoubleSide, // through a gap one sees the inside of the cloth, not the room
     vertexShader,
     fragmentShader,
     uniforms: {
