@@ -14,13 +14,20 @@ from common.transport.zenoh_session import LinkSettings
 
 @dataclass(frozen=True, slots=True)
 class RepositorySettings:
-    """The candidate poses kept (DISPOSE §6.2). ``poses``, ``megabytes``: bounds; the least used leaves first.
+    """The candidate poses kept (DISPOSE §6.2), and which is shown. ``poses``, ``megabytes``, ``search_ms``: bounds; the
+    least used leaves first. ``equal_share``: of the session's threshold, is ET. ``search``, ``hold``: as the paper
+    has them, or the best of all. ``hysteresis``: the pose on screen stays while no other's σ is lower by this share.
+    ``withhold_factor``: × the threshold, is a σ too high to show; 0: all is shown.
     ``region_weights``: ω where it is not the default; ``score_form``: what σ divides by."""
 
-    poses: int = 60
+    poses: int = 200
     megabytes: int = 512
-    search: Literal["threshold", "exhaustive"] = "threshold"
-    hold: bool = True
+    search: Literal["threshold", "exhaustive"] = "exhaustive"
+    hold: bool = False
+    hysteresis: float = 0.0
+    search_ms: float = 5.0
+    equal_share: float = 0.5
+    withhold_factor: float = 6.0
     region_weights: dict[str, float] = field(default_factory=lambda: dict(DEFAULT_WEIGHTS))
     score_form: ScoreForm = "joining-edges"
 
@@ -29,6 +36,13 @@ class RepositorySettings:
             raise ValueError(f"poses: {self.poses} is outside 1..1000")
         if not 16 <= self.megabytes <= 65_536:
             raise ValueError(f"megabytes: {self.megabytes} is outside 16..65536")
+        if not 0.1 <= self.search_ms <= 1000:
+            raise ValueError(f"search_ms: {self.search_ms} is outside 0.1..1000")
+        for name in ("hysteresis", "equal_share"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise ValueError(f"{name}: {getattr(self, name)} is outside 0..1")
+        if self.withhold_factor < 0:
+            raise ValueError(f"withhold_factor: {self.withhold_factor} is negative")
         region_weights(self.region_weights)
 
 

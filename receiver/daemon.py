@@ -193,15 +193,14 @@ class _Show:
         for mesh in shown.added:
             self.viewer.add_pose(mesh)
         self._counts += shown.counts
-        frame = shown.frame
-        if frame is None:
+        latency_ns = self._channels.age_ns(shown.frame.capture_ns, now_ns)
+        frame = shown.frame if latency_ns is None else replace(shown.frame, age_ms=latency_ns / 1e6)
+        self.viewer.show(frame)
+        if frame.withheld:  # it is on screen already; the viewer marks it
             self._counts["withheld"] += 1
             return
-        latency_ns = self._channels.age_ns(frame.capture_ns, now_ns)
         if latency_ns is not None:
             self._timer.add("capture to shown", latency_ns)
-            frame = replace(frame, age_ms=latency_ns / 1e6)
-        self.viewer.show(frame)
         self._state.shown(frame, shown.repository_poses)
         sigma = None if frame.pose_id is None else frame.sigma
         self._record("frame", [shown.epoch, frame.sequence, frame.pose_id, sigma, latency_ns])

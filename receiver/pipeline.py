@@ -6,7 +6,7 @@ DISPOSE Fig. 1, right half: the skeleton never waits for a mesh; it moves the be
 from __future__ import annotations
 
 from collections import Counter, deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from statistics import median
 
 import numpy as np
@@ -51,11 +51,12 @@ class SkeletonToShow:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Shown:
-    """What one skeleton led to. ``frame`` is None when it was withheld: the last good one stays on screen.
-    ``added``, ``removed``: how the repository changed; the viewer follows it. ``counts``: poses not taken, by cause."""
+    """What one skeleton led to. ``frame``: what to show; withheld, it is the last good one again.
+    ``removed``, then ``added``: how the repository changed; the viewer follows it. ``counts``: poses not taken, by
+    cause."""
 
     epoch: int
-    frame: ShownFrame | None
+    frame: ShownFrame
     added: tuple[RiggedMesh, ...]
     removed: tuple[int, ...]
     repository_poses: int
@@ -92,80 +93,89 @@ class AnimationPath:
     """Every skeleton: repository → pose selection by σ → animation. One thread's own."""
 
     def __init__(self, settings: Settings, timer: StageTimer, clock: Clock) -> None:
-        weights = region_weights(settings.region_weights)
-        bounds = RepositorySettings(max_poses=settings.poses, max_bytes=settings.megabytes << 20)
-        self._repository = PoseRepository(bounds, weights)
-        self._selector = PoseSelector(SelectionSettings(search=settings.search, hold=settings.hold), weights)
+        bounds = RepositorySettings(
+            max_poses=settings.poses,
+            max_bytes=settings.megabytes << 20,
+            max_search_ns=int(settings.search_ms * 1e6),
+            equal_share=settings.equal_share,
+        )
+        self._repository = PoseRepository(bounds, region_weights(settings.region_weights))
+        self._selector = PoseSelector(
+            SelectionSettings(
+                search=settings.search,
+                hold=settings.hold,
+                hysteresis=settings.hysteresis,
+                withhold_factor=settings.withhold_factor,
+            )
+        )
         self._timer = timer
         self._clock = clock
-        self._on_screen: int | None = None
+        self._shown: ShownFrame | None = None  # the last one that was not withheld
         self._search_ns: deque[int] = deque(maxlen=SEARCHES_REMEMBERED)
 
     def show(self, newest: SkeletonToShow) -> Shown:
         """Take in what has arrived, and animate the best pose for the newest skeleton."""
         packet = newest.packet
-        added: dict[int, RiggedMesh] = {}
-        removed: list[int] = list(self._follow_epoch(packet.epoch))
+        before = self._repository.pose_ids
+        arrived: dict[int, RiggedMesh] = {}
         counts: Counter[str] = Counter()
         with self._timer.stage("repository"):
+            self._follow_epoch(packet.epoch)
             while newest.arrived:
-                self._add(newest.arrived.popleft(), packet.epoch, added, removed, counts)
+                self._add(newest.arrived.popleft(), packet.epoch, arrived, counts)
         T_world_link = forward_kinematics(newest.body, packet.pose)
+        self._bound_search()  # before the choice: what is chosen stays
+        frame = self._frame(packet, T_world_link)
+        after = self._repository.pose_ids
+        added = tuple(mesh for pose_id, mesh in arrived.items() if pose_id in after)
+        return Shown(packet.epoch, frame, added, tuple(before - after), len(after), counts)
+
+    @property
+    def _on_screen(self) -> int | None:
+        return None if self._shown is None else self._shown.pose_id
+
+    def _frame(self, packet: SkeletonPacket, T_world_link: NDArray[np.float32]) -> ShownFrame:
+        """The frame to show: the last good one, marked, where this one would be too distorted."""
         selection = self._select(T_world_link)
-        removed += self._bound_search()
-        frame = None
         if selection is None:
-            self._on_screen = None
-            frame = _frame(packet, None, T_world_link, float("nan"))
-        elif not selection.withheld or self._on_screen is None or self._repository.get(self._on_screen) is None:
-            self._on_screen = selection.mesh.pose_id
-            self._repository.count_use(self._on_screen)
-            frame = _frame(packet, selection.mesh, T_world_link, selection.sigma)
-        held = len(self._repository)
-        return Shown(packet.epoch, frame, tuple(added.values()), tuple(removed), held, counts)
+            self._shown = _shown_frame(packet, None, T_world_link, float("nan"))
+            return self._shown
+        if selection.withheld and self._shown is not None and self._shown.pose_id in self._repository.pose_ids:
+            return replace(self._shown, withheld=True)
+        self._repository.count_use(selection.pose_id)
+        mesh = self._repository.get(selection.pose_id)
+        self._shown = _shown_frame(packet, mesh, T_world_link, selection.sigma)
+        return self._shown
 
     def _select(self, T_world_link: NDArray[np.float32]) -> Selection | None:
         begin_ns = self._clock.now_ns()
-        selection = self._selector.select(self._repository.by_use(), T_world_link)
+        selection = self._selector.select(self._repository, T_world_link)
         self._search_ns.append(self._clock.now_ns() - begin_ns)
         self._timer.add("selection", self._search_ns[-1])
         return selection
 
-    def _bound_search(self) -> tuple[int, ...]:
+    def _bound_search(self) -> None:
         """Keep no more poses than can be searched in time."""
         if len(self._search_ns) < SEARCHES_REMEMBERED:
-            return ()
-        pruned = self._repository.limit_search(int(median(self._search_ns)), self._on_screen)
-        if pruned:
+            return
+        if self._repository.limit_search(int(median(self._search_ns)), self._on_screen):
             self._search_ns.clear()
-        return pruned
 
-    def _add(
-        self,
-        pose: ReceivedPose,
-        epoch: int,
-        added: dict[int, RiggedMesh],
-        removed: list[int],
-        counts: Counter[str],
-    ) -> None:
+    def _add(self, pose: ReceivedPose, epoch: int, arrived: dict[int, RiggedMesh], counts: Counter[str]) -> None:
         if pose.epoch != epoch:  # of a run that is over, or of one whose first skeleton has not come yet
             counts["pose of another run"] += 1
             return
-        changes = self._repository.add(pose.mesh, epoch, self._selector.threshold.value, self._on_screen)
-        added[pose.mesh.pose_id] = pose.mesh
-        for pose_id in changes.removed:
-            if added.pop(pose_id, None) is None:
-                removed.append(pose_id)
+        self._repository.add(pose.mesh, epoch, self._selector.threshold.value, self._on_screen)
+        arrived[pose.mesh.pose_id] = pose.mesh
 
-    def _follow_epoch(self, epoch: int) -> tuple[int, ...]:
+    def _follow_epoch(self, epoch: int) -> None:
         """Nothing of an old run is shown in a new one."""
-        if epoch == self._repository.epoch:
-            return ()
-        self._on_screen = None
-        return self._repository.reset(epoch)
+        if epoch != self._repository.epoch:
+            self._shown = None
+            self._repository.reset(epoch)
 
 
-def _frame(
+def _shown_frame(
     packet: SkeletonPacket, mesh: RiggedMesh | None, T_world_link: NDArray[np.float32], sigma: float
 ) -> ShownFrame:
     return ShownFrame(

@@ -72,8 +72,11 @@ def measured(method: Method, recorded: Capture, seconds: float) -> dict[str, tup
     results: list[Fidelity] = []
     cold: list[Fidelity] = []
     nobody = 0
+    first_body_s = float("nan")
     for k in range(count):
         method.frame(k, recorded.frame(k))
+        if method.shown_k is not None and np.isnan(first_body_s):
+            first_body_s = k / FRAME_RATE_HZ
         if k % MEASURED_EVERY:
             continue
         if method.shown_k is None:
@@ -95,6 +98,7 @@ def measured(method: Method, recorded: Capture, seconds: float) -> dict[str, tup
         "iou": (float(np.mean([fidelity.iou for fidelity in warm])), "1"),
         "psnr_cold_db": (float(np.mean([fidelity.psnr_db for fidelity in cold])) if cold else float("nan"), "dB"),
         "kbit_per_s": (method.link.sent_bytes * 8e-3 / seconds + 0.25 * 8 * FRAME_RATE_HZ, "kbit/s"),
+        "first_body_s": (first_body_s, "s"),
         "switches_per_s": (method.switches / seconds, "1/s"),
         "nobody_share": (nobody / max(count // MEASURED_EVERY, 1), "1"),
     }

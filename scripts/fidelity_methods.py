@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable
-from typing import Protocol
+from typing import Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,7 +25,9 @@ from scripts.fidelity import Picture
 from scripts.fidelity_capture import FRAME_NS, FRAME_RATE_HZ
 from scripts.fidelity_link import ByteLink
 from sender.candidate_poses.mesh_scheduler import MeshScheduler
-from sender.candidate_poses.usable_pose_set import UsablePoseSet
+from sender.config import CandidateSettings
+from sender.fitting.tracker import FitResult
+from sender.pipeline import CandidatePath, StreamIdentity, TrackedFrame
 
 CANDIDATE_EVERY = 6  # frames: 200 ms, as in the sender
 LEAST_CONFIDENCE = 0.5
@@ -90,16 +92,22 @@ class _Animated:
 
 
 class Dispose(_Animated):
-    """Both pipelines whole: usable pose set, χ, scheduler; repository, selection by σ."""
+    """Both pipelines whole: what is worth sending, scheduler; repository, selection by σ."""
 
-    def __init__(self, rate_bps: float, own: bool, settings: RepositorySettings | None = None) -> None:
+    def __init__(
+        self,
+        rate_bps: float,
+        own: bool,
+        settings: RepositorySettings | None = None,
+        choice: Literal["coverage", "paper"] = "coverage",
+    ) -> None:
         super().__init__(rate_bps, own)
-        self._usable = UsablePoseSet()
+        clock = _NoClock()
+        self._candidates = CandidatePath(StreamIdentity(0, 1), CandidateSettings(choice=choice), StageTimer(clock))
         self._scheduler = MeshScheduler()
         self._scheduler.receiver_joined("receiver", 1)
-        clock = _NoClock()
         self._animation = AnimationPath(settings or RepositorySettings(), StageTimer(clock), clock)
-        self._arrived: list[ReceivedPose] = []
+        self._arrived: deque[ReceivedPose] = deque()
         self._meshes: dict[int, RiggedMesh] = {}
 
     def frame(self, k: int, captured: CapturedFrame) -> None:
@@ -107,22 +115,15 @@ class Dispose(_Animated):
         fitted = posed(captured, self.own)
         self.link.start_frame()
         if fitted is not None:
-            self._usable.add_skeleton(k * FRAME_NS, forward_kinematics(fitted[0], fitted[1]))
-        if k % CANDIDATE_EVERY == 0:
-            self._offer(k, captured)
+            tracked = _tracked(k, captured, fitted)
+            self._candidates.remember(tracked)
+            if k % CANDIDATE_EVERY == 0 and self._candidates.may_become_one(tracked):
+                self._candidates.note_budget(self._scheduler.budget_bytes)
+                found = self._candidates.process(tracked)
+                self._scheduler.offer(found.pose_id, found.encoded, found.capture_ns, found.worth, found.preview)
         self._carry(k)
         if fitted is not None:
             self._animate(k, fitted)
-
-    def _offer(self, k: int, captured: CapturedFrame) -> None:
-        encoded = encoded_candidate(self._poses + 1, k, captured, self.own)
-        if encoded is None:
-            return
-        self._poses += 1
-        self._usable.add_pose(mesh_of(encoded, 0).mesh)
-        chi = self._usable.quotients()
-        self._scheduler.offer(self._poses, encoded, k * FRAME_NS, chi.get(self._poses, 0.0))
-        self._scheduler.update(chi, self._usable.retained())
 
     def _carry(self, k: int) -> None:
         while True:
@@ -132,8 +133,8 @@ class Dispose(_Animated):
                 if chosen is None:
                     return
                 record = self._scheduler.sent("receiver", chosen[0], k * FRAME_NS)
-                if record is not None:
-                    self._usable.sent(record.pose_id, record.retain_threshold)
+                if record is not None and not record.preview:
+                    self._candidates.note_sent(record.pose_id, record.retain_threshold)
                 self.link.send(chosen[1], len(chosen[1]))
             message = self.link.arrived()
             if message is None:
@@ -144,13 +145,20 @@ class Dispose(_Animated):
     def _animate(self, k: int, fitted: tuple[Skeleton, SkeletonPose, float]) -> None:
         skeleton, pose, confidence = fitted
         packet = SkeletonPacket(0, 1, k, k * FRAME_NS, 1, confidence, pose, None)
-        shown = self._animation.show(SkeletonToShow(packet, skeleton, deque(self._arrived)))
-        self._arrived.clear()
+        shown = self._animation.show(SkeletonToShow(packet, skeleton, self._arrived))
         self._meshes |= {mesh.pose_id: mesh for mesh in shown.added}
-        if shown.frame is not None and shown.frame.pose_id is not None and shown.frame.motion is not None:
+        if not shown.frame.withheld and shown.frame.pose_id is not None and shown.frame.motion is not None:
             self._show(k, self._meshes[shown.frame.pose_id], shown.frame.motion)
         for pose_id in shown.removed:
             self._meshes.pop(pose_id, None)
+
+
+def _tracked(k: int, captured: CapturedFrame, fitted: tuple[Skeleton, SkeletonPose, float]) -> TrackedFrame:
+    """The frame as the sender's skeleton path would hand it on."""
+    skeleton, pose, confidence = fitted
+    fit = FitResult(skeleton, pose, True, 1, 1.0, 0.0, confidence)
+    T_world_link = forward_kinematics(skeleton, pose)
+    return TrackedFrame(k * FRAME_NS, captured.views, fit, skeleton=skeleton, pose=pose, T_world_link=T_world_link)
 
 
 class LastMesh(_Animated):
@@ -216,9 +224,12 @@ class Ceiling(_Animated):
         return super().picture(cameras)
 
 
+PAPER = RepositorySettings(search="threshold", hold=True)
 METHODS: dict[str, Callable[[float, bool], Method]] = {
     "dispose": Dispose,
-    "dispose-exhaustive": lambda rate, own: Dispose(rate, own, RepositorySettings(search="exhaustive", hold=False)),
+    "dispose-paper": lambda rate, own: Dispose(rate, own, PAPER, "paper"),
+    "dispose-paper-sender": lambda rate, own: Dispose(rate, own, choice="paper"),
+    "dispose-paper-receiver": lambda rate, own: Dispose(rate, own, PAPER),
     "last-mesh": LastMesh,
     "first-mesh": FirstMesh,
     "ceiling": Ceiling,

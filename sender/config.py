@@ -66,29 +66,36 @@ class TrackingSettings:
 
 @dataclass(frozen=True, slots=True)
 class CandidateSettings:
-    """Candidate poses. ``interval_ms``: time between two that are considered. ``least_confidence``: of a fit, for its
-    frame to become one. ``jpeg_quality``, ``depth_step_mm``: how finely a view is sent. ``segmentation``: what
-    belongs to which link. ``region_weights``: ω where it
+    """Candidate poses. ``choice``: what is sent next, by "coverage" or by the "paper"'s χ. ``interval_ms``: time
+    between two that are considered. ``least_confidence``: of a fit, for its frame to become one. ``jpeg_quality``,
+    ``depth_step_mm``: how finely a view is sent; the ``thin_`` ones where a pose would take long. ``send_log``: a file
+    that gets a JSON line for every send. ``segmentation``: what belongs to which link. ``region_weights``: ω where it
     is not the default; ``score_form``: what σ divides by."""
 
     enabled: bool = True
+    choice: Literal["coverage", "paper"] = "coverage"
     interval_ms: float = 200.0
     least_confidence: float = 0.5
     jpeg_quality: int = 85
     depth_step_mm: int = 2
+    thin_jpeg_quality: int = 50
+    thin_depth_step_mm: int = 8
     segmentation: Segmentation = "voronoi"
     region_weights: dict[str, float] = field(default_factory=lambda: dict(DEFAULT_WEIGHTS))
     score_form: ScoreForm = "joining-edges"
+    send_log: Path | None = None
 
     def __post_init__(self) -> None:
         if not 0 <= self.interval_ms <= 60_000:
             raise ValueError(f"interval_ms: {self.interval_ms} is outside 0..60000")
         if not 0 <= self.least_confidence <= 1:
             raise ValueError(f"least_confidence: {self.least_confidence} is outside 0..1")
-        if not 30 <= self.jpeg_quality <= 100:
-            raise ValueError(f"jpeg_quality: {self.jpeg_quality} is outside 30..100")
-        if not 1 <= self.depth_step_mm <= 16:
-            raise ValueError(f"depth_step_mm: {self.depth_step_mm} is outside 1..16")
+        for name in ("jpeg_quality", "thin_jpeg_quality"):
+            if not 30 <= getattr(self, name) <= 100:
+                raise ValueError(f"{name}: {getattr(self, name)} is outside 30..100")
+        for name in ("depth_step_mm", "thin_depth_step_mm"):
+            if not 1 <= getattr(self, name) <= 16:
+                raise ValueError(f"{name}: {getattr(self, name)} is outside 1..16")
         region_weights(self.region_weights)
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import secrets
+from pathlib import Path
 from typing import Any
 
 from common.runtime.clock import MonotonicClock
@@ -38,6 +39,7 @@ from sender.receiver_links import ReceiverLinks
 from sender.reconstruction.person_points import DepthReconstruction, HullReconstruction
 from sender.rehearsal import rehearse_all, rehearse_candidates
 from sender.self_view import SelfView, open_self_view
+from sender.send_log import SendLog
 
 log = logging.getLogger(__name__)
 
@@ -108,6 +110,7 @@ class SenderDaemon:
         except OSError as error:
             raise DaemonError(f"http: {error}") from error
         finally:
+            stream.close()
             if self._settings.stats_file is not None:
                 write_statistics(self._settings.stats_file, stream.figures())
 
@@ -140,6 +143,7 @@ class _Stream:
         self._skeletons = self._skeleton_path(identity)
         self._candidates = CandidatePath(identity, settings.poses, self._timer)
         self._scheduler = MeshScheduler()
+        self._send_log = _open_send_log(settings.poses.send_log)
         self._channels = SenderChannels(session, settings.site, settings.person, clock)
         self._links = ReceiverLinks(
             identity.epoch, self._scheduler, self._channels.bulk_publisher, self._on_sent, clock
@@ -158,6 +162,10 @@ class _Stream:
         self._skeleton_bytes_max = 0
         self._candidate_bytes: list[int] = []
         self.metrics = self._make_metrics()
+
+    def close(self) -> None:
+        """Write out what is buffered."""
+        self._send_log.close()
 
     def _skeleton_path(self, identity: StreamIdentity) -> SkeletonPath:
         source, settings = self._source, self._settings
@@ -223,12 +231,12 @@ class _Stream:
             self._candidates.remember(tracked)
             if tracked.capture_ns >= self._next_candidate_ns and self._candidates.may_become_one(tracked):
                 self._next_candidate_ns = tracked.capture_ns + int(self._settings.poses.interval_ms * 1e6)
+                self._candidates.note_budget(self._scheduler.budget_bytes)
                 self._meshing.submit(tracked)
 
     def _on_candidates(self, found: Candidates) -> None:
         """On the loop: what may be sent now."""
-        self._scheduler.offer(found.pose_id, found.encoded, found.capture_ns, found.chi.get(found.pose_id, 0.0))
-        self._scheduler.update(found.chi, found.retained)
+        self._scheduler.offer(found.pose_id, found.encoded, found.capture_ns, found.worth, found.preview)
         self._candidate_bytes.append(len(found.encoded))
         self._links.wake()
 
@@ -236,9 +244,10 @@ class _Stream:
         """On the loop: a pose is on its way to a receiver."""
         self._poses_sent += 1
         # The self view's link has no bandwidth worth a thought: what goes there must not thin out what others get.
-        if self._self_view is None or record.receiver_id != self._self_view.name:
+        for_others = self._self_view is None or record.receiver_id != self._self_view.name
+        if for_others and not record.preview:
             self._candidates.note_sent(record.pose_id, record.retain_threshold)
-        log.debug("send %s", record)
+        self._send_log.add(record)
 
     def _tell_status(self) -> None:
         status = (self._outside or self._tracker).status
@@ -286,6 +295,7 @@ class _Stream:
             "skeleton_bytes_max": self._skeleton_bytes_max,
             "candidate_poses_considered": len(sizes),
             "candidate_poses_sent": self._poses_sent,
+            "sends": self._send_log.figures(),
             "candidate_poses_delivered": self._links.delivered_poses,
             "candidate_pose_bytes_mean": sum(sizes) / len(sizes) if sizes else 0,
             "receivers": dict(self._links.counts),
@@ -294,6 +304,13 @@ class _Stream:
             "rig_cpu_share": rig.status.get("cpu_s", 0.0) / max(rig_elapsed_s, 1e-3) if rig else None,
             "rig": rig.status if rig else None,
         }
+
+
+def _open_send_log(file: Path | None) -> SendLog:
+    try:
+        return SendLog(file)
+    except OSError as error:
+        raise DaemonError(f"[poses] send_log: {error}") from error
 
 
 def _outside_tracker(source: FrameSource) -> OutsideTracker | None:

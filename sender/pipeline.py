@@ -23,7 +23,9 @@ from common.runtime.stage_timer import StageTimer
 from common.wire.body_message import BodyMessage, encode_body, quantized_skeleton
 from common.wire.candidate_pose import CandidatePose, decode_candidate_pose, encode_candidate_pose
 from common.wire.skeleton_packet import SkeletonPacket, encode_skeleton, quantized_pose
-from sender.candidate_poses.usable_pose_set import UsablePoseSet, UsablePoseSettings
+from sender.candidate_poses.pose_coverage import Coverage, CoverageSet
+from sender.candidate_poses.preview import encode_preview
+from sender.candidate_poses.usable_pose_set import Quotients, UsablePoseSet
 from sender.capture.frame_set import FrameSet
 from sender.config import CandidateSettings
 from sender.fitting.outside_tracker import OutsideTracker
@@ -31,6 +33,9 @@ from sender.fitting.start_joints import skeleton_from_joints
 from sender.fitting.tracker import MINIMUM_POINTS, FitResult, Tracker
 from sender.reconstruction.person_points import Reconstruction
 
+FINE_BYTES = 80_000  # of a pose sent finely, before one was
+THIN_S = 0.5  # a link is thin if a fine pose takes longer
+SKELETONS_WAITING, SENDS_WAITING = 300, 64  # for the next candidate pose
 BODY_CHANGE_M = 0.001  # sizes that differ by less are the same body to a receiver
 
 
@@ -157,27 +162,32 @@ class SkeletonPath:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Candidates:
-    """What one captured frame changed: the new pose as sent, its χ, and χ and retained flags of the usable pose set."""
+    """What one captured frame changed: the new pose as sent, its small ``preview``, and what the poses are worth."""
 
     pose_id: int
     encoded: bytes
+    preview: bytes
     capture_ns: int
-    chi: dict[int, float]
-    retained: frozenset[int]
+    worth: Quotients | Coverage
 
 
 class CandidatePath:
-    """Some frames: views → rigged mesh → usable pose set and rigging quotients. ``process`` is one thread's own;
-    ``remember`` and ``note_sent`` may be called from another."""
+    """Some frames: views → rigged mesh → what it is worth sending. ``process`` is one thread's own; ``remember`` and
+    ``note_sent`` may be called from another."""
 
     def __init__(self, identity: StreamIdentity, settings: CandidateSettings, timer: StageTimer) -> None:
         self._identity = identity
         self._settings = settings
         self._timer = timer
-        self._usable = UsablePoseSet(region_weights=region_weights(settings.region_weights))
+        weights = region_weights(settings.region_weights)
+        self._choice: UsablePoseSet | CoverageSet = (
+            UsablePoseSet(region_weights=weights) if settings.choice == "paper" else CoverageSet(region_weights=weights)
+        )
         self._poses = 0
-        self._skeletons: deque[tuple[int, NDArray[np.float32]]] = deque(maxlen=UsablePoseSettings().max_skeletons)
-        self._sent: deque[tuple[int, float]] = deque(maxlen=UsablePoseSettings().max_poses)
+        self._budget_bytes: int | None = None
+        self._fine_bytes = FINE_BYTES
+        self._skeletons: deque[tuple[int, NDArray[np.float32]]] = deque(maxlen=SKELETONS_WAITING)
+        self._sent: deque[tuple[int, float]] = deque(maxlen=SENDS_WAITING)
 
     def may_become_one(self, tracked: TrackedFrame) -> bool:
         """Whether a frame is fit to become a candidate pose: somebody is seen, by every camera that is there, and the
@@ -187,12 +197,18 @@ class CandidatePath:
         return seen and fit is not None and fit.confidence >= self._settings.least_confidence
 
     def remember(self, tracked: TrackedFrame) -> None:
-        """A skeleton was sent: candidate poses are judged by how many of those they animate."""
-        if tracked.T_world_link is not None:
+        """A skeleton was sent: candidate poses are judged by how many of those they animate. Doubtful ones do not
+        count: no pose should be sought for what the person never did."""
+        fit = tracked.fit
+        if tracked.T_world_link is not None and fit is not None and fit.confidence >= self._settings.least_confidence:
             self._skeletons.append((tracked.capture_ns, tracked.T_world_link))
 
+    def note_budget(self, bytes_per_s: int | None) -> None:
+        """What the thinnest link to a receiver can carry; None while there is none."""
+        self._budget_bytes = bytes_per_s
+
     def note_sent(self, pose_id: int, retain_threshold: float) -> None:
-        """A pose went out to a receiver, when RT was ``retain_threshold``."""
+        """A whole pose went out to a receiver, when RT was ``retain_threshold``."""
         self._sent.append((pose_id, retain_threshold))
 
     def process(self, tracked: TrackedFrame) -> Candidates:
@@ -201,43 +217,53 @@ class CandidatePath:
         The mesh is built from the encoded views, as the receiver will build it, so both ends judge the same one.
         """
         with self._timer.stage("encode views"):
-            encoded = self._encode(tracked)
+            candidate = self._candidate(tracked)
+            encoded = self._encode(candidate)
+            preview = encode_preview(candidate)
         with self._timer.stage("candidate mesh"):
-            candidate = decode_candidate_pose(encoded)
+            decoded = decode_candidate_pose(encoded)
             mesh = build_rigged_mesh(
-                candidate.pose_id,
-                candidate.capture_ns,
-                candidate.skeleton,
-                candidate.pose,
-                candidate.views,
-                candidate.rigging,
+                decoded.pose_id,
+                decoded.capture_ns,
+                decoded.skeleton,
+                decoded.pose,
+                decoded.views,
+                decoded.rigging,
                 self._settings.score_form,
             )
         with self._timer.stage("usable poses"):
             while self._sent:
-                self._usable.sent(*self._sent.popleft())
+                self._choice.sent(*self._sent.popleft())
             while self._skeletons:
-                self._usable.add_skeleton(*self._skeletons.popleft())
-            self._usable.add_pose(mesh)
-            chi, retained = self._usable.quotients(), self._usable.retained()
-        return Candidates(candidate.pose_id, encoded, candidate.capture_ns, chi, retained)
+                self._choice.add_skeleton(*self._skeletons.popleft())
+            self._choice.add_pose(mesh)
+            worth = self._choice.worth()
+        return Candidates(candidate.pose_id, encoded, preview, candidate.capture_ns, worth)
 
-    def _encode(self, tracked: TrackedFrame) -> bytes:
+    def _encode(self, candidate: CandidatePose) -> bytes:
+        """The pose as finely as its link allows: where it takes long, more poses are worth more than finer ones."""
+        settings, budget_bytes = self._settings, self._budget_bytes
+        thin = budget_bytes is not None and self._fine_bytes > budget_bytes * THIN_S
+        if thin:
+            return encode_candidate_pose(candidate, settings.thin_jpeg_quality, settings.thin_depth_step_mm)
+        encoded = encode_candidate_pose(candidate, settings.jpeg_quality, settings.depth_step_mm)
+        self._fine_bytes = len(encoded)
+        return encoded
+
+    def _candidate(self, tracked: TrackedFrame) -> CandidatePose:
         assert tracked.skeleton is not None
         assert tracked.fit is not None
-        identity, settings = self._identity, self._settings
         self._poses += 1
-        candidate = CandidatePose(
+        return CandidatePose(
             pose_id=self._poses,
-            person=identity.person,
-            epoch=identity.epoch,
+            person=self._identity.person,
+            epoch=self._identity.epoch,
             capture_ns=tracked.capture_ns,
             skeleton=tracked.skeleton,
             pose=tracked.fit.pose,  # not the quantised one: rounding twice could end elsewhere than the packet's
             views=tracked.views,
-            rigging=Rigging(settings.segmentation),
+            rigging=Rigging(self._settings.segmentation),
         )
-        return encode_candidate_pose(candidate, settings.jpeg_quality, settings.depth_step_mm)
 
 
 def _largest_change_m(a: Skeleton, b: Skeleton) -> float:

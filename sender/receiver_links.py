@@ -9,7 +9,7 @@ from collections.abc import Callable, Hashable
 from dataclasses import dataclass
 
 from common.runtime.clock import Clock
-from common.transport.bulk_sender import BulkMessage, BulkSender
+from common.transport.bulk_sender import PERIOD_NS, BulkMessage, BulkSender
 from common.transport.bulk_window import BulkWindow
 from common.transport.channel_publisher import ChannelPublisher
 from common.transport.channel_subscriber import Arrival
@@ -114,17 +114,19 @@ class ReceiverLinks:
 
         def next_message(budget_bytes: int) -> BulkMessage | None:
             now_ns = self._clock.now_ns()
-            chosen = self._scheduler.next_for(name, budget_bytes, now_ns)
+            chosen = self._scheduler.next_for(name, budget_bytes * 1_000_000_000 // PERIOD_NS, now_ns)
             if chosen is None:
                 return None
-            record = self._scheduler.sent(name, chosen[0], now_ns)  # the bulk sender sees it through
-            if record is not None:
-                self._on_sent(record)
-            return BulkMessage(*chosen)
+            pose_id, payload = chosen
+            record = self._scheduler.sent(name, pose_id, now_ns)  # the bulk sender sees it through
+            if record is None:
+                return None
+            self._on_sent(record)
+            return BulkMessage((pose_id, record.preview), payload)
 
-        def delivered(pose_id: Hashable) -> None:
+        def delivered(message: Hashable) -> None:
             self.delivered_poses += 1
-            log.debug("pose %s delivered to %s", pose_id, name)
+            log.debug("pose %s delivered to %s", message, name)
 
         bulk = BulkSender(publisher, BulkWindow(self._epoch), self._epoch, next_message, delivered, self._clock)
         task = self._group.create_task(bulk.run(), name=f"bulk to {name}")

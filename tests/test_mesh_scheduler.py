@@ -1,195 +1,290 @@
-"""What goes to whom next: first picture at once, best χ, the newest when there is room, late joiners, bounds."""
+"""What goes to whom next: first picture at once, the paper's rule and coverage, late joiners, bounds."""
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sender.candidate_poses.mesh_scheduler import MeshScheduler, Reason, SchedulerSettings
+from sender.candidate_poses.mesh_scheduler import MeshScheduler, Reason, SchedulerSettings, SendRecord
+from sender.candidate_poses.pose_coverage import Coverage
+from sender.candidate_poses.usable_pose_set import Quotients
 
 SECOND = 1_000_000_000
 POSE_BYTES = 1000
-SMALL, AMPLE = 2 * POSE_BYTES, 10 * POSE_BYTES  # budgets of a period
+SMALL, AMPLE = 2 * POSE_BYTES, 10 * POSE_BYTES  # budgets of a second
 
 
-def scheduler_with(*chis: float, settings: SchedulerSettings | None = None) -> MeshScheduler:
-    """Poses 0, 1, … offered in this order, with a receiver "r" that holds nothing."""
-    scheduler = MeshScheduler(settings)
-    for pose_id, chi in enumerate(chis):
-        offer(scheduler, pose_id, chi)
-    scheduler.receiver_joined("r", epoch=1)
-    return scheduler
+class Sender:
+    """A scheduler fed by the paper's rule, with a receiver "r" that holds nothing."""
+
+    def __init__(self, *chis: float, settings: SchedulerSettings | None = None) -> None:
+        self.scheduler = MeshScheduler(settings)
+        self.chi: dict[int, float] = {}
+        for pose_id, chi in enumerate(chis):
+            self.offer(pose_id, chi)
+        self.scheduler.receiver_joined("r", epoch=1)
+
+    def offer(self, pose_id: int, chi: float | None, retained: frozenset[int] = frozenset(), preview: int = 0) -> None:
+        """A new pose; ``chi`` None: the usable set rejects it."""
+        if chi is not None:
+            self.chi[pose_id] = chi
+        self.scheduler.offer(
+            pose_id, payload(pose_id), pose_id * SECOND, Quotients(dict(self.chi), retained), b"s" * preview or None
+        )
+
+    def send(self, budget: int = SMALL, receiver: str = "r") -> SendRecord | None:
+        """One decision carried out."""
+        return send(self.scheduler, budget, receiver)
+
+    def ids(self, count: int, budget: int = SMALL, receiver: str = "r") -> list[int | None]:
+        records = [self.send(budget, receiver) for _ in range(count)]
+        return [None if record is None else record.pose_id for record in records]
 
 
-def offer(scheduler: MeshScheduler, pose_id: int, chi: float, size: int = POSE_BYTES) -> None:
-    scheduler.offer(pose_id, bytes([pose_id % 256]) * size, pose_id * SECOND, chi)
+def payload(pose_id: int) -> bytes:
+    return bytes([pose_id % 256]) * POSE_BYTES
 
 
-def send(scheduler: MeshScheduler, budget: int = SMALL, now_ns: int = 0, receiver: str = "r") -> int | None:
-    """One decision carried out; the id sent."""
-    chosen = scheduler.next_for(receiver, budget, now_ns)
+def send(scheduler: MeshScheduler, budget: int = SMALL, receiver: str = "r") -> SendRecord | None:
+    chosen = scheduler.next_for(receiver, budget, 0)
     if chosen is None:
         return None
-    assert scheduler.sent(receiver, chosen[0], now_ns) is not None
-    return chosen[0]
+    record = scheduler.sent(receiver, chosen[0], 0)
+    assert record is not None
+    assert record.size_bytes == len(chosen[1])
+    return record
 
 
 def test_a_receiver_with_nothing_gets_the_newest_at_once_whatever_the_budget() -> None:
-    scheduler = scheduler_with(0.9, 0.2)
-    assert scheduler.next_for("r", 0, 0) == (1, bytes([1]) * POSE_BYTES)
-    record = scheduler.sent("r", 1, 5)
+    sender = Sender(0.9, 0.2)
+    assert sender.scheduler.next_for("r", 0, 0) == (1, payload(1))
+    record = sender.scheduler.sent("r", 1, 5)
     assert record is not None
-    assert record.reason is Reason.FIRST
+    assert (record.reason, record.sent_ns, record.preview) == (Reason.FIRST, 5, False)
+
+
+def test_over_a_thin_link_the_first_sight_is_a_preview_and_the_whole_pose_comes_later() -> None:
+    sender = Sender(0.3)
+    sender.offer(1, 0.9, preview=90)
+    first = sender.send(POSE_BYTES)
+    assert first is not None
+    assert (first.pose_id, first.reason, first.preview, first.size_bytes) == (1, Reason.FIRST, True, 90)
+    second = sender.send(POSE_BYTES)
+    assert second is not None
+    assert (second.pose_id, second.reason, second.preview) == (1, Reason.BEST, False)
+    assert sender.ids(2) == [0, None]
+
+
+def test_over_a_wide_link_the_first_sight_is_whole() -> None:
+    sender = Sender()
+    sender.offer(1, 0.9, preview=90)
+    first = sender.send(100 * POSE_BYTES)
+    assert first is not None
+    assert not first.preview
+
+
+def test_a_preview_is_of_the_newest_only() -> None:
+    sender = Sender()
+    sender.offer(1, 0.9, preview=90)
+    sender.offer(2, 0.9, preview=90)
+    assert sender.scheduler.held_bytes == 2 * POSE_BYTES + 90
 
 
 def test_then_the_best_quotient_goes_first() -> None:
-    scheduler = scheduler_with(0.3, 0.9, 0.5, 0.1)
-    assert [send(scheduler) for _ in range(5)] == [3, 1, 2, 0, None]
+    assert Sender(0.3, 0.9, 0.5, 0.1).ids(5) == [3, 1, 2, 0, None]
 
 
 def test_nothing_is_sent_twice() -> None:
-    scheduler = scheduler_with(0.3)
-    assert send(scheduler) == 0
-    assert scheduler.next_for("r", AMPLE, SECOND) is None
+    assert Sender(0.3).ids(2, AMPLE) == [0, None]
 
 
-def test_with_ample_bandwidth_the_newest_goes_before_the_best() -> None:
-    scheduler = scheduler_with(0.9, 0.1)
-    assert send(scheduler) == 1
-    offer(scheduler, 2, 0.0)
-    assert scheduler.next_for("r", SMALL, 0) == (0, bytes([0]) * POSE_BYTES)
-    assert [send(scheduler, AMPLE) for _ in range(3)] == [2, 0, None]
+def test_by_the_paper_the_newest_has_no_privilege() -> None:
+    sender = Sender(0.9, 0.5)
+    assert sender.ids(1, AMPLE) == [1]
+    sender.offer(2, 0.1)
+    assert sender.ids(2, AMPLE) == [0, 2]
 
 
-def test_retained_poses_go_before_better_ones() -> None:
-    scheduler = scheduler_with(0.5, 0.6, 0.7, 0.1)
-    assert send(scheduler) == 3
-    scheduler.update({0: 0.5, 1: 0.6, 2: 0.7, 3: 0.1}, retained=[0, 1])
-    chosen = scheduler.next_for("r", SMALL, 0)
-    assert chosen is not None
-    record = scheduler.sent("r", chosen[0], 0)
+def test_a_pose_that_animates_nothing_is_not_sent() -> None:
+    sender = Sender(0.4, 0.0)
+    assert sender.ids(1) == [1]  # there is nobody on screen yet
+    sender.offer(2, 0.0)
+    assert sender.ids(2) == [0, None]
+
+
+def test_retained_poses_go_before_better_ones_if_they_pass_the_retain_threshold() -> None:
+    sender = Sender(0.5, 0.6, 0.7)
+    sender.offer(3, 0.1, retained=frozenset([0, 1]))
+    assert sender.ids(1) == [3]
+    record = sender.send()
     assert record is not None
     assert (record.pose_id, record.reason) == (1, Reason.RETAINED)
+    sender.chi[0] = 0.1
+    sender.offer(4, 0.2, retained=frozenset([0]))
+    record = sender.send()
+    assert record is not None
+    assert (record.pose_id, record.reason) == (2, Reason.BEST)  # RT is 0.28
 
 
-def test_a_record_says_why() -> None:
-    scheduler = scheduler_with(0.8, 0.4, 0.1)
-    send(scheduler)
-    scheduler.next_for("r", SMALL, 7)
-    record = scheduler.sent("r", 0, 9)
+@pytest.mark.parametrize(("budget", "share"), [(1, 0.001 / 4), (SMALL, 0.5), (AMPLE, 1.0)])
+def test_a_record_says_why_and_rt_is_proportional_to_the_bandwidth(budget: int, share: float) -> None:
+    sender = Sender(0.8, 0.4, 0.1)
+    sender.send()
+    sender.scheduler.next_for("r", budget, 7)
+    record = sender.scheduler.sent("r", 0, 9)
     assert record is not None
     assert (record.receiver_id, record.pose_id, record.reason) == ("r", 0, Reason.BEST)
     assert (record.chi, record.chi_best) == (0.8, 0.8)
-    assert record.retain_threshold == pytest.approx(
-        0.8 * (SMALL / (4 * POSE_BYTES)) * 0.8
-    )  # RT: share × bandwidth × χ_s
-    assert (record.size_bytes, record.budget_bytes, record.chosen_ns, record.sent_ns) == (POSE_BYTES, SMALL, 7, 9)
-
-
-def test_what_does_not_fit_waits_until_it_would_have_fitted() -> None:
-    scheduler = scheduler_with(0.5, 0.6)
-    assert send(scheduler, now_ns=0) == 1
-    third = POSE_BYTES // 3 + 1
-    assert send(scheduler, third, now_ns=2 * SECOND) is None
-    assert send(scheduler, third, now_ns=3 * SECOND) == 0
+    assert record.retain_threshold == pytest.approx(0.8 * share * 0.8)  # RT: percentage × bandwidth × χ_s
+    assert (record.size_bytes, record.budget_bytes, record.chosen_ns, record.sent_ns) == (POSE_BYTES, budget, 7, 9)
 
 
 def test_no_budget_no_pose() -> None:
-    scheduler = scheduler_with(0.5, 0.6)
-    send(scheduler)
-    assert send(scheduler, 0, now_ns=100 * SECOND) is None
-
-
-def test_a_smaller_pose_may_go_where_a_better_one_does_not_fit() -> None:
-    scheduler = scheduler_with(0.5)
-    offer(scheduler, 1, 0.9, size=50 * POSE_BYTES)
-    offer(scheduler, 2, 0.1)
-    assert send(scheduler) == 2
-    assert send(scheduler) == 0
+    assert Sender(0.5, 0.6).ids(1) == [1]
+    sender = Sender(0.5, 0.6)
+    sender.send()
+    assert sender.send(0) is None
 
 
 def test_asking_again_abandons_the_pose_given_last() -> None:
-    scheduler = scheduler_with(0.5)
-    assert scheduler.next_for("r", SMALL, 0) is not None
-    offer(scheduler, 1, 0.1)
-    assert scheduler.next_for("r", SMALL, 0) == (1, bytes([1]) * POSE_BYTES)  # superseded before it was out
-    assert scheduler.sent("r", 0, 0) is None
-    assert scheduler.sent("r", 1, 0) is not None
+    sender = Sender(0.5)
+    assert sender.scheduler.next_for("r", SMALL, 0) is not None
+    sender.offer(1, 0.1)
+    assert sender.scheduler.next_for("r", SMALL, 0) == (1, payload(1))  # superseded before it was out
+    assert sender.scheduler.sent("r", 0, 0) is None
+    assert sender.scheduler.sent("r", 1, 0) is not None
 
 
 def test_a_late_joiner_gets_the_newest_then_what_others_got_best_first() -> None:
-    scheduler = scheduler_with(0.3, 0.9, 0.5)
-    while send(scheduler) is not None:
-        pass
-    scheduler.update({})  # the usable set has moved on
-    offer(scheduler, 3, 0.2)
-    scheduler.receiver_joined("late", epoch=9)
-    assert [send(scheduler, receiver="late") for _ in range(5)] == [3, 1, 2, 0, None]
+    sender = Sender(0.3, 0.9, 0.5)
+    assert sender.ids(4)[-1] is None
+    sender.chi = {}  # the usable set has moved on
+    sender.offer(3, 0.2)
+    sender.scheduler.receiver_joined("late", epoch=9)
+    assert sender.ids(5, receiver="late") == [3, 1, 2, 0, None]
 
 
 def test_a_receiver_keeps_what_it_has_until_it_restarts() -> None:
-    scheduler = scheduler_with(0.3)
-    send(scheduler)
-    scheduler.receiver_joined("r", epoch=1)
-    assert send(scheduler) is None
-    scheduler.receiver_joined("r", epoch=2)
-    assert send(scheduler) == 0
+    sender = Sender(0.3)
+    sender.send()
+    sender.scheduler.receiver_joined("r", epoch=1)
+    assert sender.ids(1) == [None]
+    sender.scheduler.receiver_joined("r", epoch=2)
+    assert sender.ids(1) == [0]
 
 
 def test_a_receiver_that_holds_poses_is_not_sent_them() -> None:
-    scheduler = scheduler_with(0.3, 0.4)
-    scheduler.receiver_joined("s", epoch=1, holding=[0, 77])
-    assert [send(scheduler, receiver="s"), send(scheduler, receiver="s")] == [1, None]
+    sender = Sender(0.3, 0.4)
+    sender.scheduler.receiver_joined("s", epoch=1, holding=[0, 77])
+    assert sender.ids(2, receiver="s") == [1, None]
 
 
 def test_strangers_and_those_who_left_get_nothing() -> None:
-    scheduler = scheduler_with(0.3)
+    scheduler = Sender(0.3).scheduler
     scheduler.receiver_left("r")
     scheduler.receiver_left("never seen")
     assert scheduler.next_for("r", AMPLE, 0) is None
     assert scheduler.sent("r", 0, 0) is None
 
 
-def test_receivers_are_bounded() -> None:
-    scheduler = MeshScheduler(SchedulerSettings(max_receivers=1))
+def test_receivers_are_bounded_and_the_thinnest_link_is_known() -> None:
+    scheduler = MeshScheduler(SchedulerSettings(max_receivers=2))
+    assert scheduler.budget_bytes is None
     assert scheduler.receiver_joined("a", 1)
-    assert not scheduler.receiver_joined("b", 1)
+    assert scheduler.receiver_joined("b", 1)
+    assert not scheduler.receiver_joined("c", 1)
     assert scheduler.receiver_joined("a", 2)
+    scheduler.next_for("a", 3000, 0)
+    scheduler.next_for("b", 2000, 0)
+    assert scheduler.budget_bytes == 2000
 
 
 def test_poses_that_left_the_usable_set_unsent_are_forgotten_but_the_newest() -> None:
-    scheduler = scheduler_with(0.3, 0.9, 0.2)
-    scheduler.update({1: 0.7})
-    assert [send(scheduler) for _ in range(3)] == [2, 1, None]
-
-
-def test_a_rejected_pose_gives_way_to_the_next() -> None:
-    scheduler = scheduler_with(0.5, 0.0, 0.0)
-    assert [send(scheduler, AMPLE) for _ in range(3)] == [2, 0, None]
+    sender = Sender(0.3, 0.9)
+    sender.chi = {1: 0.7}
+    sender.offer(2, None)
+    assert sender.ids(3) == [2, 1, None]
 
 
 def test_memory_is_bounded_and_the_worst_go_first() -> None:
-    scheduler = scheduler_with(0.5, 0.2, 0.9, 0.1, settings=SchedulerSettings(max_bytes=3 * POSE_BYTES))
-    assert scheduler.held_bytes == 3 * POSE_BYTES
-    assert [send(scheduler) for _ in range(4)] == [3, 2, 0, None]
+    sender = Sender(0.5, 0.2, 0.9, 0.1, settings=SchedulerSettings(max_bytes=3 * POSE_BYTES))
+    assert sender.scheduler.held_bytes == 3 * POSE_BYTES
+    assert sender.ids(4) == [3, 2, 0, None]
+
+
+# Poses 0 and 1 look alike and are good for three of four skeletons; pose 2 for the fourth only; pose 3 for none.
+SIGMAS = np.array([[0.1, 0.1, 0.1, 2.0], [0.1, 0.1, 0.2, 2.0], [2.0, 2.0, 2.0, 0.1], [3.0, 3.0, 3.0, 3.0]], np.float32)
+COVERAGE = Coverage((0, 1, 2, 3), SIGMAS, np.full(4, 0.25, np.float32))
+
+
+def by_coverage(*holding: int, ids: tuple[int, ...] = (0, 1, 2, 3)) -> MeshScheduler:
+    scheduler = MeshScheduler()
+    rows = [COVERAGE.pose_ids.index(pose_id) for pose_id in ids]
+    for pose_id in ids:
+        coverage = Coverage(ids, COVERAGE.sigmas[rows], COVERAGE.weights)
+        scheduler.offer(pose_id, payload(pose_id), pose_id * SECOND, coverage)
+    scheduler.receiver_joined("r", 1, holding)
+    return scheduler
+
+
+def test_by_coverage_the_pose_that_adds_most_to_what_the_receiver_has_goes_next() -> None:
+    scheduler = by_coverage(0)
+    record = send(scheduler)
+    assert record is not None
+    assert (record.pose_id, record.reason) == (2, Reason.GAIN)  # not 1, though it animates more
+    assert record.chi == pytest.approx((2.0 - 0.1) / 4)
+    assert record.retain_threshold == 0
+    assert send(scheduler) is None  # 1 and 3 add nothing
+
+
+def test_each_receiver_has_its_own_coverage() -> None:
+    scheduler = by_coverage(0)
+    scheduler.receiver_joined("s", 1, [2])
+    assert [send(scheduler, SMALL, name) and send(scheduler, SMALL, name) for name in "rs"] == [None, None]
+    scheduler = by_coverage(0)
+    scheduler.receiver_joined("s", 1, [2])
+    first = [send(scheduler, SMALL, name) for name in "rs"]
+    assert [record.pose_id for record in first if record is not None] == [2, 0]
+
+
+def test_with_ample_bandwidth_the_newest_goes_first_whatever_it_adds() -> None:
+    scheduler = by_coverage(0)
+    records = [send(scheduler, AMPLE) for _ in range(3)]
+    assert [record and (record.pose_id, record.reason) for record in records] == [
+        (3, Reason.NEWEST),
+        (2, Reason.GAIN),
+        None,
+    ]
+
+
+def test_what_left_the_coverage_unsent_is_forgotten() -> None:
+    scheduler = by_coverage(0)
+    kept = Coverage((0, 4), SIGMAS[[0, 2]], COVERAGE.weights)
+    scheduler.offer(4, payload(4), 4 * SECOND, kept)
+    assert scheduler.held_bytes == 2 * POSE_BYTES
+    record = send(scheduler)
+    assert record is not None
+    assert record.pose_id == 4
 
 
 @settings(max_examples=40, deadline=None)
-@given(st.lists(st.tuples(st.sampled_from("osujl"), st.integers(0, 30), st.floats(0, 1)), max_size=60))
+@given(st.lists(st.tuples(st.sampled_from("ocsjl"), st.integers(0, 30), st.floats(0, 1)), max_size=60))
 def test_bounds_hold_whatever_happens(events: list[tuple[str, int, float]]) -> None:
     limits = SchedulerSettings(max_bytes=6 * POSE_BYTES, max_poses=5, max_receivers=3)
     scheduler = MeshScheduler(limits)
     for now, (event, number, chi) in enumerate(events):
         receiver = f"r{number % 5}"
         if event == "o":
-            offer(scheduler, number, chi, size=1 + number * 100)
+            scheduler.offer(number, b"p" * (1 + number * 100), now, Quotients({number: chi}, frozenset([number])), b"s")
+        elif event == "c":
+            sigmas = np.full((1, 3), chi, np.float32)
+            scheduler.offer(number, b"p" * 500, now, Coverage((number,), sigmas, np.full(3, 1 / 3, np.float32)))
         elif event == "s":
-            chosen = scheduler.next_for(receiver, int(chi * AMPLE), now * SECOND)
+            chosen = scheduler.next_for(receiver, int(chi * AMPLE), now)
             if chosen is not None:
-                assert scheduler.sent(receiver, chosen[0], now * SECOND) is not None
-        elif event == "u":
-            scheduler.update({number: chi}, retained=[number])
+                assert scheduler.sent(receiver, chosen[0], now) is not None
         elif event == "j":
             scheduler.receiver_joined(receiver, number % 2)
         else:

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 from collections import deque
+from typing import Literal
 
 import numpy as np
 import pytest
 
 from common.body.body_regions import REGION_INDEX, default_region_weights
 from common.body.skeleton import Skeleton
-from common.body.skeleton_pose import named_joint_positions, rest_pose
+from common.body.skeleton_pose import forward_kinematics, named_joint_positions, rest_pose
 from common.runtime.clock import ManualClock
 from common.runtime.stage_timer import StageTimer
 from common.wire.body_message import decode_body
@@ -18,6 +19,8 @@ from common.wire.header import WireError
 from common.wire.skeleton_packet import SkeletonPacket, decode_skeleton
 from receiver.config import RepositorySettings
 from receiver.pipeline import AnimationPath, ReceivedPose, SkeletonToShow, mesh_of
+from sender.candidate_poses.pose_coverage import Coverage
+from sender.candidate_poses.usable_pose_set import Quotients
 from sender.capture.frame_set import FrameSet
 from sender.config import CandidateSettings
 from sender.pipeline import CandidatePath, TrackedFrame
@@ -107,21 +110,52 @@ def test_a_doubtful_fit_never_becomes_a_candidate():
     assert not path.may_become_one(dataclasses.replace(frame, complete=False))
 
 
-def test_candidates_gather_skeletons_and_their_quotients():
-    path = CandidatePath(IDENTITY, CandidateSettings(), timer())
+@pytest.mark.parametrize("choice", ["coverage", "paper"])
+def test_candidates_gather_skeletons_and_what_the_poses_are_worth(choice: Literal["coverage", "paper"]) -> None:
+    path = CandidatePath(IDENTITY, CandidateSettings(choice=choice), timer())
     frames = with_packet()
     found = None
     for frame in frames[-12:]:
         path.remember(frame)
         found = path.process(frame)
     assert found is not None
-    assert found.chi
-    assert max(found.chi.values()) > 0  # standing still, one pose animates its neighbours
+    if choice == "paper":
+        assert isinstance(found.worth, Quotients)
+        assert max(found.worth.chi.values()) > 0  # standing still, one pose animates its neighbours
+    else:
+        assert isinstance(found.worth, Coverage)
+        assert found.worth.pose_ids == tuple(range(1, 13))
+        assert found.worth.gains([12], ())[0] > 0
+
+
+def test_a_doubtful_skeleton_does_not_count_when_poses_are_judged() -> None:
+    frame = with_packet()[-1]
+    assert frame.fit is not None
+    path = CandidatePath(IDENTITY, CandidateSettings(), timer())
+    path.remember(dataclasses.replace(frame, fit=dataclasses.replace(frame.fit, confidence=0.3)))
+    nothing = path.process(frame).worth
+    path.remember(frame)
+    something = path.process(frame).worth
+    assert isinstance(nothing, Coverage)
+    assert isinstance(something, Coverage)
+    assert (nothing.sigmas.shape[1], something.sigmas.shape[1]) == (0, 1)
+
+
+def test_over_a_thin_link_poses_are_sent_smaller_and_a_preview_is_a_fraction_of_them() -> None:
+    frame = with_packet()[-1]
+    path = CandidatePath(IDENTITY, CandidateSettings(), timer())
+    fine = path.process(frame)
+    path.note_budget(len(fine.encoded))
+    thin = path.process(frame)
+    path.note_budget(10 * len(fine.encoded))
+    assert len(thin.encoded) < 0.7 * len(fine.encoded)
+    assert len(path.process(frame).encoded) == len(fine.encoded)
+    assert len(fine.preview) < 0.3 * len(fine.encoded)
+    assert mesh_of(fine.preview, 0).mesh.pose_id == mesh_of(fine.encoded, 0).mesh.pose_id
 
 
 def test_a_skeleton_alone_shows_joints_and_no_mesh():
     shown = animation_path().show(SkeletonToShow(packet_of(with_packet()[-1]), last_body(), deque()))
-    assert shown.frame is not None
     assert shown.frame.pose_id is None
     assert shown.frame.motion is None
     assert shown.repository_poses == 0
@@ -132,7 +166,6 @@ def test_a_received_pose_is_animated_by_the_next_skeleton():
     pose = received_pose(first)
     shown = animation_path().show(SkeletonToShow(packet_of(last), last_body(), deque([pose])))
     assert [mesh.pose_id for mesh in shown.added] == [pose.mesh.pose_id]
-    assert shown.frame is not None
     assert shown.frame.pose_id == pose.mesh.pose_id
     assert np.isfinite(shown.frame.sigma)
     assert shown.frame.region_sigma is not None
@@ -153,20 +186,26 @@ def test_a_new_run_of_the_sender_starts_with_an_empty_repository():
     assert len(shown.removed) == 1
     assert shown.repository_poses == 0
     assert shown.counts["pose of another run"] == 1
-    assert shown.frame is not None
     assert shown.frame.pose_id is None
 
 
-def test_a_skeleton_that_would_tear_the_mesh_is_withheld_and_the_last_good_frame_stays():
+def test_a_skeleton_that_would_tear_the_mesh_is_withheld_and_the_last_good_frame_stays_marked() -> None:
     frame = with_packet()[-1]
     path = animation_path()
     good = packet_of(frame)
     path.show(SkeletonToShow(good, last_body(), deque([received_pose(frame)])))
-    for _ in range(20):  # the session learns what σ is usual
-        assert path.show(SkeletonToShow(good, last_body(), deque())).frame is not None
-    torn = dataclasses.replace(good, pose=rest_pose(good.pose.root_position))
-    assert path.show(SkeletonToShow(torn, last_body(), deque())).frame is None
-    assert path.show(SkeletonToShow(good, last_body(), deque())).frame is not None
+    for number in range(1, 21):  # the session learns what σ is usual
+        shown = path.show(SkeletonToShow(dataclasses.replace(good, sequence=number), last_body(), deque()))
+        assert not shown.frame.withheld
+    torn = dataclasses.replace(good, pose=rest_pose(good.pose.root_position), sequence=21)
+    shown = path.show(SkeletonToShow(torn, last_body(), deque()))
+    assert (shown.frame.withheld, shown.frame.sequence) == (True, 20)
+    np.testing.assert_array_equal(shown.frame.joints, forward_kinematics(last_body(), good.pose)[:, :3, 3])
+    assert not path.show(SkeletonToShow(good, last_body(), deque())).frame.withheld
+    unmindful = AnimationPath(RepositorySettings(withhold_factor=0), timer(), ManualClock())
+    for packet in (*[good] * 20, torn):
+        shown = unmindful.show(SkeletonToShow(packet, last_body(), deque([received_pose(frame)])))
+    assert not shown.frame.withheld
 
 
 def test_another_persons_pose_is_refused():

@@ -13,6 +13,7 @@ from common.transport.channel_subscriber import Arrival
 from common.wire.header import WireError
 from common.wire.receiver_report import ReceiverReport, encode_report
 from sender.candidate_poses.mesh_scheduler import MeshScheduler, SendRecord
+from sender.candidate_poses.usable_pose_set import Quotients
 from sender.receiver_links import GONE_AFTER_NS, LOOK_EVERY_S, RECEIVERS_MAX, ReceiverLinks
 
 EPOCH = 5
@@ -38,7 +39,7 @@ class Bench:
     def __init__(self) -> None:
         self.clock = ManualClock(10**9)
         self.scheduler = MeshScheduler()
-        self.scheduler.offer(1, b"p" * 5000, capture_ns=1, chi=0.5)
+        self.scheduler.offer(1, b"p" * 5000, 1, Quotients({1: 0.5}))
         self.publishers: dict[str, list[RecordingPublisher]] = {}
         self.records: list[SendRecord] = []
         self.links = ReceiverLinks(EPOCH, self.scheduler, self._open, self.records.append, self.clock)

@@ -97,8 +97,8 @@ def _scores(points, rest, pair_regions, pair_links, pair_starts, region_lengths,
     for n in range(len(T)):
         for p in range(len(pair_links)):
             a, b = pair_regions[p, 0], pair_regions[p, 1]
-            _seen_from(T[n], pair_links[p, 0], pair_links[p, 1], R, t)
-            change = _length_change(points, rest, pair_starts[p], pair_starts[p + 1], R, t)
+            seen_from(T[n], pair_links[p, 0], pair_links[p, 1], R, t)
+            change = length_change(points, rest, pair_starts[p], pair_starts[p + 1], R, t)
             out[n] += change * (omega[a] / region_lengths[a] + omega[b] / region_lengths[b]) / regions
     return out
 
@@ -109,16 +109,16 @@ def _region_changes(points, rest, pair_regions, pair_links, pair_starts, region_
     out = np.zeros(region_count, np.float32)
     R, t = np.empty((3, 3), np.float32), np.empty(3, np.float32)
     for p in range(len(pair_links)):
-        _seen_from(T, pair_links[p, 0], pair_links[p, 1], R, t)
-        change = _length_change(points, rest, pair_starts[p], pair_starts[p + 1], R, t)
+        seen_from(T, pair_links[p, 0], pair_links[p, 1], R, t)
+        change = length_change(points, rest, pair_starts[p], pair_starts[p + 1], R, t)
         out[pair_regions[p, 0]] += change
         out[pair_regions[p, 1]] += change
     return out
 
 
 @njit(nogil=True, cache=True, error_model="numpy", fastmath={"reassoc", "contract", "nsz"})
-def _seen_from(T, a, b, R, t):  # type: ignore[no-untyped-def]
-    """Rotation ``R`` and place ``t`` of link b in the frame of link a, of links ``T`` (L, 4, 4)."""
+def seen_from(T, a, b, R, t):  # type: ignore[no-untyped-def]
+    """Rotation ``R`` and place ``t`` of link b in the frame of link a, of links ``T`` (L, 4, 4). For kernels."""
     for i in range(3):
         t[i] = 0
         for k in range(3):
@@ -128,7 +128,7 @@ def _seen_from(T, a, b, R, t):  # type: ignore[no-untyped-def]
 
 
 @njit(nogil=True, cache=True, error_model="numpy", fastmath={"reassoc", "contract", "nsz"})
-def _length_change(points, rest, start, end, R, t):  # type: ignore[no-untyped-def]
+def length_change(points, rest, start, end, R, t):  # type: ignore[no-untyped-def]
     """Σ|Δlen(e)| [m] over the edges start:end of one pair of links, the second at (R, t) in the first's frame."""
     ax, ay, az = points[0, start:end], points[1, start:end], points[2, start:end]
     bx, by, bz = points[3, start:end], points[4, start:end], points[5, start:end]

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from common.body.body_regions import default_region_weights
 from common.body.distortion_score import distortion_scores
+from common.body.joint_edge_store import JointEdgeStore
 from common.body.rigged_mesh import RiggedMesh
 from common.body.skeleton_pose import forward_kinematics
 
@@ -22,8 +23,8 @@ class RepositorySettings:
     """Bounds of the repository, and ET: a new pose replaces those whose skeleton it takes with σ below
     ``equal_share`` × the session's threshold (the paper's ET is below 0.1 where its threshold is 0.15)."""
 
-    max_poses: int = 100
-    max_bytes: int = 256 << 20
+    max_poses: int = 200
+    max_bytes: int = 512 << 20
     max_search_ns: int = 10_000_000
     equal_share: float = 0.5
 
@@ -42,6 +43,10 @@ class Changes:
         return self.reset + self.replaced + self.pruned
 
 
+# A pose of fewer texels than one in so many of the finest here is a preview: shown only while there is nothing better.
+PREVIEW_SHARE = 4
+
+
 @dataclass(slots=True, eq=False)
 class _Entry:
     mesh: RiggedMesh
@@ -58,20 +63,30 @@ class PoseRepository:
         self._settings = settings or RepositorySettings()
         self._weights = default_region_weights() if region_weights is None else region_weights
         self._entries: dict[int, _Entry] = {}
+        self._edges = JointEdgeStore(self._weights)
         self.epoch: int | None = None
 
     def __len__(self) -> int:
         return len(self._entries)
 
     @property
+    def pose_ids(self) -> frozenset[int]:
+        """All that is here."""
+        return frozenset(self._entries)
+
+    @property
     def nbytes(self) -> int:
         """Memory of the meshes [bytes]."""
         return sum(entry.mesh.nbytes for entry in self._entries.values())
+
+    def __contains__(self, pose_id: int) -> bool:
+        return pose_id in self._entries
 
     def reset(self, epoch: int) -> tuple[int, ...]:
         """Start a new sender run: nothing of the old one stays. Returns the ids removed."""
         removed = tuple(self._entries)
         self._entries.clear()
+        self._edges.clear()
         self.epoch = epoch
         return removed
 
@@ -79,26 +94,35 @@ class PoseRepository:
         """Take in a received pose; ``threshold`` is the session's, ``on_screen`` the pose being shown.
 
         A new ``epoch`` empties the repository first. The new pose counts as used once, and takes over the uses of
-        those it replaces. The pose on screen may be replaced, but is never pruned.
+        those it replaces. The pose on screen is neither replaced nor pruned: a viewer may need a while to take in
+        another one.
         """
         reset = self.reset(epoch) if epoch != self.epoch else ()
         T_world_link = forward_kinematics(mesh.skeleton, mesh.pose)
         replaced = self._animated_by(mesh, threshold * self._settings.equal_share)
-        uses = 1 + sum(self._entries.pop(pose_id).uses for pose_id in replaced)
-        self._entries.pop(mesh.pose_id, None)
+        replaced = tuple(i for i in replaced if i != on_screen and i != mesh.pose_id)
+        uses = 1 + sum(self._forget(pose_id).uses for pose_id in (*replaced, mesh.pose_id) if pose_id in self)
         self._entries[mesh.pose_id] = _Entry(mesh, T_world_link, uses)
+        self._edges.add(mesh.pose_id, mesh.joint_edges)
         pruned = self._prune(self._settings.max_poses, {mesh.pose_id, on_screen})
-        return Changes(tuple(i for i in replaced if i != mesh.pose_id), pruned, reset)
+        return Changes(replaced, pruned, reset)
 
     def count_use(self, pose_id: int) -> None:
         """The pose was selected for a frame."""
         if pose_id in self._entries:
             self._entries[pose_id].uses += 1
 
-    def by_use(self) -> list[RiggedMesh]:
-        """All poses, most used first, the newer of equals first (DISPOSE §5.3)."""
-        entries = sorted(self._entries.values(), key=lambda e: (-e.uses, -e.mesh.capture_ns))
-        return [entry.mesh for entry in entries]
+    def by_use(self) -> list[int]:
+        """The poses to search, most used first, the newer of equals first (DISPOSE §5.3); previews only when there is
+        nothing else."""
+        finest = max((e.mesh.mesh.texture.size for e in self._entries.values()), default=0)
+        whole = [e for e in self._entries.values() if e.mesh.mesh.texture.size * PREVIEW_SHARE > finest]
+        whole.sort(key=lambda e: (-e.uses, -e.mesh.capture_ns))
+        return [entry.mesh.pose_id for entry in whole]
+
+    def scores(self, pose_ids: list[int], T_world_link: NDArray[np.float32], limit: float = 0.0) -> NDArray[np.float32]:
+        """σ of some poses, in their order, up to and with the first one below ``limit``: ``JointEdgeStore.scores``."""
+        return self._edges.scores(pose_ids, T_world_link, limit)
 
     def get(self, pose_id: int) -> RiggedMesh | None:
         """The pose of that id, if it is here."""
@@ -133,5 +157,9 @@ class PoseRepository:
                 break
             held_bytes -= entry.mesh.nbytes
             pruned.append(entry.mesh.pose_id)
-            del self._entries[entry.mesh.pose_id]
+            self._forget(entry.mesh.pose_id)
         return tuple(pruned)
+
+    def _forget(self, pose_id: int) -> _Entry:
+        self._edges.remove(pose_id)
+        return self._entries.pop(pose_id)

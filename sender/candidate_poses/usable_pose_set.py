@@ -7,6 +7,7 @@ accurately. σ of every pose for every buffered skeleton is kept, so a new skele
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import StrEnum
 
@@ -45,6 +46,14 @@ class Admission:
 
     verdict: Verdict
     removed: tuple[int, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Quotients:
+    """By the paper: ``chi`` of the usable poses, and which of them are ``retained`` for the next time."""
+
+    chi: Mapping[int, float]
+    retained: frozenset[int] = frozenset()
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,6 +125,10 @@ class UsablePoseSet:
             pose_id: float(np.count_nonzero(pose.sigmas[buffered] < limit)) / count
             for pose_id, pose in self._poses.items()
         }
+
+    def worth(self) -> Quotients:
+        """χ of all poses, and the retained ones, for who sends them."""
+        return Quotients(self.quotients(), self.retained())
 
     def retained(self) -> frozenset[int]:
         """Poses flagged for transmission when an earlier one was sent."""
