@@ -3,61 +3,96 @@
 from __future__ import annotations
 
 import argparse
+import os
 import sys
+import tempfile
 import time
-from collections.abc import Iterator
+from collections import deque
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from functools import lru_cache, partial
 from pathlib import Path
 
 import numpy as np
 
 from scripts.fidelity import Fidelity, compare, measuring_cameras
 from scripts.fidelity_capture import FRAME_RATE_HZ, Capture, capture, show_progress
-from scripts.fidelity_methods import METHODS, Method
+from scripts.fidelity_link import SKELETON_BYTES
+from scripts.fidelity_methods import Method, Screen
+from scripts.fidelity_rivals import ALL_METHODS, WITHOUT_BANDWIDTH, WITHOUT_SKELETON, open_method
 from scripts.run_bench import Row
 
 SESSION_S = 180.0
 CAPTURED_S = 14.0  # of a motion, repeated: what is held in memory
 WARM_UP_S = 10.0
-MEASURED_EVERY = 15  # frames
+MEASURED_EVERY = 29  # frames: prime, so that a repeated motion is not looked at in the same few places
 BANDWIDTHS_BPS = (0.1e6, 0.2e6, 1e6, 10e6)
 SEEN_AFTER = 3  # frames: 100 ms
 CASES = (("male_avg", "14_06"), ("male_avg", "02_10"))
 
 
+@dataclass(frozen=True, slots=True)
+class Case:
+    """Who does what before how many cameras."""
+
+    body: str
+    motion: str | None
+    cameras: int
+
+    def __str__(self) -> str:
+        return f"{self.body}/{self.motion or 'routine'}/{self.cameras}"
+
+
+@dataclass(frozen=True, slots=True)
+class Session:
+    """What is the same for all methods: bandwidths, length, data and where captures are kept."""
+
+    rates_bps: tuple[float, ...]
+    seconds: float
+    data: Path | None
+    captures: Path
+
+
 def add_options(parser: argparse.ArgumentParser) -> None:
     """This bench's own options."""
-    parser.add_argument("--methods", default=",".join(METHODS), help=f"of {', '.join(METHODS)}, separated by commas")
+    parser.add_argument(
+        "--methods", default=",".join(ALL_METHODS), help=f"of {', '.join(ALL_METHODS)}, separated by commas"
+    )
     parser.add_argument(
         "--bandwidths", default=",".join(f"{bps / 1e6:g}" for bps in BANDWIDTHS_BPS), help="Mbit/s, separated by commas"
     )
     parser.add_argument("--skeletons", default="true,own", help="true, own (our tracker's), or both")
     parser.add_argument("--captures", type=Path, help="folder where captured motions are kept for the next time")
+    parser.add_argument("--cameras", default="4", help="how many, separated by commas: 1 is a frontal one")
+    parser.add_argument("--bodies", default="", help="only these bodies, in every clip of --clips")
+    parser.add_argument("--jobs", type=int, default=1, help="processes")
 
 
 def run(
     data: Path | None, seconds: float | None, clips: tuple[str, ...], methods: str, bandwidths: str, skeletons: str,
-    captures: Path | None = None,
+    captures: Path | None = None, cameras: str = "4", bodies: str = "", jobs: int = 1,
 ) -> Iterator[Row]:  # fmt: skip
     """Rows for every body, motion, bandwidth, method and skeleton. ``seconds``: length of a session."""
-    chosen = _chosen(methods, tuple(METHODS))
+    chosen = _chosen(methods, ALL_METHODS)
     owns = [word == "own" for word in _chosen(skeletons, ("true", "own"))]
-    rates_bps = [float(word) * 1e6 for word in bandwidths.split(",")]
-    for body, motion in _cases(data, clips):
-        case = f"{body}/{motion or 'routine'}/4"
-        recorded = capture(body, motion, data, 4, CAPTURED_S, show_progress(f"capturing {case}"), captures)
-        for bandwidth_bps in rates_bps:
-            for name in chosen:
-                for own in owns:
-                    label = f"{case}/{bandwidth_bps / 1e6:g}M/{name}-{'own' if own else 'true'}"
-                    begun = time.monotonic()
-                    figures = measured(METHODS[name](bandwidth_bps, own), recorded, seconds or SESSION_S)
-                    yield from (Row(case=label, metric=metric, value=value, unit=unit, reference=None, source="")
-                                for metric, (value, unit) in figures.items())  # fmt: skip
-                    told = "  ".join(f"{m} {v:.2f}" for m, (v, _) in figures.items())
-                    print(f"\r{label}: {told}  ({time.monotonic() - begun:.0f} s)", file=sys.stderr, flush=True)
+    rates_bps = tuple(float(word) * 1e6 for word in bandwidths.split(","))
+    kept = captures or Path(tempfile.gettempdir()) / f"telepose-captures-{os.getuid()}"
+    session = Session(rates_bps, seconds or SESSION_S, data, kept)
+    cases = [Case(*who, int(count)) for who in _cases(data, clips, bodies) for count in cameras.split(",")]
+    tasks = [(case, name, own) for case in cases for name in chosen
+             for own in (owns[:1] if name in WITHOUT_SKELETON else owns)]  # fmt: skip
+    if jobs == 1:
+        for task in tasks:
+            yield from _rows(session, *task)
+        return
+    with ProcessPoolExecutor(jobs) as workers:
+        list(workers.map(partial(_captured, session.data, kept), cases))
+        for rows in workers.map(partial(_rows, session), *zip(*tasks, strict=True)):
+            yield from rows
 
 
-def _chosen(words: str, known: tuple[str, ...]) -> list[str]:
+def _chosen(words: str, known: Sequence[str]) -> list[str]:
     """The words of an option, in the order given; unknown ones end the bench."""
     chosen = [word for word in words.split(",") if word]
     for word in chosen:
@@ -66,46 +101,104 @@ def _chosen(words: str, known: tuple[str, ...]) -> list[str]:
     return chosen
 
 
+def _captured(data: Path | None, kept: Path, case: Case) -> None:
+    _capture_of(data, kept, case)
+
+
+@lru_cache(maxsize=1)
+def _capture_of(data: Path | None, kept: Path, case: Case) -> Capture:
+    return capture(case.body, case.motion, data, case.cameras, CAPTURED_S, show_progress(f"capturing {case}"), kept)
+
+
+def _rows(session: Session, case: Case, name: str, own: bool) -> list[Row]:
+    """One method's rows at every bandwidth."""
+    recorded = _capture_of(session.data, session.captures, case)
+    rows = []
+    for rate_bps in session.rates_bps[-1:] if name in WITHOUT_BANDWIDTH else session.rates_bps:
+        skeleton = "" if name in WITHOUT_SKELETON else "-own" if own else "-true"
+        rate = "any" if name in WITHOUT_BANDWIDTH else f"{rate_bps / 1e6:g}M"
+        label = f"{case}/{rate}/{name}{skeleton}"
+        begun = time.monotonic()
+        figures = measured(open_method(name, recorded, rate_bps, own), recorded, session.seconds)
+        rows += [Row(case=label, metric=metric, value=value, unit=unit, reference=None, source="")
+                 for metric, (value, unit) in figures.items()]  # fmt: skip
+        told = "  ".join(f"{m} {v:.2f}" for m, (v, _) in figures.items())
+        print(f"\r{label}: {told}  ({time.monotonic() - begun:.0f} s)", file=sys.stderr, flush=True)
+    return rows
+
+
 def measured(method: Method, recorded: Capture, seconds: float) -> dict[str, tuple[float, str]]:
-    """Plays a session to a method and compares what is on screen with the truth at the time of what is shown."""
+    """Plays a session to a method and compares what is on screen with the truth: that of the frame shown, and
+    (``psnr_seen_db``) that of the instant, for which the screen may wait 100 ms: a player shows, of what it has then,
+    the newest that is not of a later instant. Where nobody is on screen yet there is nothing to compare."""
     count = int(seconds * FRAME_RATE_HZ)
-    results: list[Fidelity] = []
-    cold: list[Fidelity] = []
-    nobody = 0
-    first_body_s = float("nan")
+    shown: dict[int, Fidelity] = {}
+    seen: dict[int, Fidelity] = {}
+    first_k, measured_count = None, 0
+    screens: deque[Screen | None] = deque(maxlen=SEEN_AFTER + 1)
     for k in range(count):
         method.frame(k, recorded.frame(k))
-        if method.shown_k is not None and np.isnan(first_body_s):
-            first_body_s = k / FRAME_RATE_HZ
-        if k % MEASURED_EVERY:
-            continue
-        if method.shown_k is None:
-            nobody += 1
-            continue
-        surface = recorded.performer.surface(recorded.frame(method.shown_k).time_s)
-        picture = method.picture(measuring_cameras(surface))
-        if picture is None:
-            nobody += 1
-            continue
-        fidelity = compare(recorded.truth(method.shown_k), picture)
-        (cold if k < WARM_UP_S * FRAME_RATE_HZ else results).append(fidelity)
-    warm = results or cold
-    psnr = np.array([fidelity.psnr_db for fidelity in warm])
+        screens.append(method.screen)
+        if method.screen is not None and first_k is None:
+            first_k = k
+        if k % MEASURED_EVERY == 0:
+            measured_count += 1
+            if method.screen is not None:
+                shown[k] = _fidelity(method.screen, recorded, method.screen.shown_k)
+        instant = k - SEEN_AFTER
+        if instant % MEASURED_EVERY == 0:
+            at = next((s for s in reversed(screens) if s is not None and s.shown_k <= instant), None)
+            if at is not None and at is screens[0] and at.shown_k == instant:
+                seen[instant] = shown[instant]
+            elif at is not None:
+                seen[instant] = _fidelity(at, recorded, instant)
     return {
-        "psnr_db": (float(psnr.mean()), "dB"),
-        "psnr_p5_db": (float(np.percentile(psnr, 5)), "dB"),
-        "psnr_inside_db": (float(np.mean([fidelity.psnr_inside_db for fidelity in warm])), "dB"),
-        "iou": (float(np.mean([fidelity.iou for fidelity in warm])), "1"),
-        "psnr_cold_db": (float(np.mean([fidelity.psnr_db for fidelity in cold])) if cold else float("nan"), "dB"),
-        "kbit_per_s": (method.link.sent_bytes * 8e-3 / seconds + 0.25 * 8 * FRAME_RATE_HZ, "kbit/s"),
-        "first_body_s": (first_body_s, "s"),
+        **_summary(shown, seen),
+        "first_body_s": (float("nan") if first_k is None else first_k / FRAME_RATE_HZ, "s"),
+        "kbit_per_s": (_bits_per_s(method, seconds) / 1e3, "kbit/s"),
         "switches_per_s": (method.switches / seconds, "1/s"),
-        "nobody_share": (nobody / max(count // MEASURED_EVERY, 1), "1"),
+        "nobody_share": (1 - len(shown) / max(measured_count, 1), "1"),
     }
 
 
-def _cases(data: Path | None, clips: tuple[str, ...]) -> list[tuple[str, str | None]]:
-    known: list[tuple[str, str | None]] = [("builtin", None)]
-    if data is not None:
-        known += CASES
+def _fidelity(screen: Screen, recorded: Capture, k: int) -> Fidelity:
+    """What is on screen against the truth of frame k."""
+    cameras = measuring_cameras(recorded.performer.surface(recorded.frame(k).time_s))
+    return compare(recorded.truth(k), screen.picture(cameras))
+
+
+def _summary(shown: dict[int, Fidelity], seen: dict[int, Fidelity]) -> dict[str, tuple[float, str]]:
+    """Means once the session is warm (of a shorter one, all), and of the cold start."""
+    warm_k = WARM_UP_S * FRAME_RATE_HZ
+    if not any(k >= warm_k for k in shown):
+        warm_k = 0
+    warm = [fidelity for k, fidelity in shown.items() if k >= warm_k]
+    seen_db = [fidelity.psnr_db for k, fidelity in seen.items() if k >= warm_k]
+    cold_db = [fidelity.psnr_db for k, fidelity in shown.items() if k < WARM_UP_S * FRAME_RATE_HZ]
+    cold_seen_db = [fidelity.psnr_db for k, fidelity in seen.items() if k < WARM_UP_S * FRAME_RATE_HZ]
+    psnr_db = [fidelity.psnr_db for fidelity in warm]
+    return {
+        "psnr_db": (_mean(psnr_db), "dB"),
+        "psnr_p5_db": (float(np.percentile(psnr_db, 5)) if psnr_db else float("nan"), "dB"),
+        "psnr_seen_db": (_mean(seen_db), "dB"),
+        "psnr_inside_db": (_mean([fidelity.psnr_inside_db for fidelity in warm]), "dB"),
+        "iou": (_mean([fidelity.iou for fidelity in warm]), "1"),
+        "psnr_cold_db": (_mean(cold_db), "dB"),
+        "psnr_seen_cold_db": (_mean(cold_seen_db), "dB"),
+    }
+
+
+def _mean(values: list[float]) -> float:
+    return float(np.mean(values)) if values else float("nan")
+
+
+def _bits_per_s(method: Method, seconds: float) -> float:
+    skeletons = SKELETON_BYTES * 8 * FRAME_RATE_HZ if method.link.skeletons else 0
+    return method.link.sent_bytes * 8 / seconds + skeletons
+
+
+def _cases(data: Path | None, clips: tuple[str, ...], bodies: str) -> list[tuple[str, str | None]]:
+    if bodies:
+        return [(body, None if clip == "routine" else clip) for body in bodies.split(",") for clip in clips]
+    known: list[tuple[str, str | None]] = [("builtin", None), *(CASES if data is not None else ())]
     return [(body, motion) for body, motion in known if not clips or (motion or "routine") in clips]

@@ -29,6 +29,7 @@ FRAME_RATE_HZ = 30
 FRAME_NS = round(1e9 / FRAME_RATE_HZ)
 START_S = 2.0  # start pose and blend
 POINTS = 2500
+TRUTHS_KEPT = 64  # of 10 MB
 
 
 class Capture:
@@ -38,6 +39,11 @@ class Capture:
         self.performer = performer
         self._frames = frames
         self._truth: dict[int, list[Picture]] = {}
+
+    @property
+    def length(self) -> int:
+        """How many frames there are before the motion repeats."""
+        return len(self._frames)
 
     def index(self, k: int) -> int:
         """Which captured frame is the k-th of a session."""
@@ -52,6 +58,8 @@ class Capture:
         """The true person at frame k in the six measuring views; kept."""
         index = self.index(k)
         if index not in self._truth:
+            if len(self._truth) >= TRUTHS_KEPT:
+                self._truth.clear()
             surface = self.performer.surface(self._frames[index].time_s)
             look = self.performer.mesh
             colours = look.vertex_colours if look.uv is None or look.texture is None else (look.uv, look.texture)

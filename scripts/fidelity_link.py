@@ -14,9 +14,11 @@ class _Message:
 
 
 class ByteLink:
-    """A rate and nothing else: delay is the same for all methods and is left out. ``sent_bytes``: bulk so far."""
+    """A rate and nothing else: delay is the same for all methods and is left out. ``sent_bytes``: bulk so far.
+    ``skeletons``: one a frame takes its part."""
 
     def __init__(self, rate_bps: float, frame_rate_hz: float, skeletons: bool) -> None:
+        self.skeletons = skeletons
         per_frame = rate_bps / 8 / frame_rate_hz
         self.bytes_per_frame = max(per_frame - (SKELETON_BYTES if skeletons else 0), 0.0)
         self.sent_bytes = 0.0

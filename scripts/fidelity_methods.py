@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
 from typing import Literal, Protocol
 
 import numpy as np
@@ -34,16 +36,23 @@ LEAST_CONFIDENCE = 0.5
 DEPTH_STEP_MM, JPEG_QUALITY = 2, 85
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Screen:
+    """What is on screen: the posture of frame ``shown_k``, and how it looks from cameras."""
+
+    shown_k: int
+    picture: Callable[[list[Camera]], list[Picture]]
+
+
 class Method(Protocol):
-    """``frame``: the k-th frame is captured, and as much as the link carries in a frame's time arrives. ``picture``:
-    what is then on screen. ``shown_k``: the frame whose posture that is; None: nobody."""
+    """``frame``: the k-th frame is captured, and as much as the link carries in a frame's time arrives. ``screen``:
+    what is then on screen; None: nobody."""
 
     link: ByteLink
 
     def frame(self, k: int, captured: CapturedFrame) -> None: ...
-    def picture(self, cameras: list[Camera]) -> list[Picture] | None: ...
     @property
-    def shown_k(self) -> int | None: ...
+    def screen(self) -> Screen | None: ...
     @property
     def switches(self) -> int: ...
 
@@ -67,28 +76,27 @@ class _NoClock:
         return 0
 
 
+def animated_picture(mesh: RiggedMesh, motion: NDArray[np.float32], cameras: list[Camera]) -> list[Picture]:
+    """A mesh moved, seen by the cameras."""
+    vertices = animate(mesh, motion)
+    return [render(vertices, mesh.faces_drawn, mesh.mesh.surface, camera) for camera in cameras]
+
+
 class _Animated:
     """Shared by the methods that animate a captured mesh: which mesh, and the links it is moved to."""
 
     def __init__(self, rate_bps: float, own: bool) -> None:
         self.link = ByteLink(rate_bps, FRAME_RATE_HZ, skeletons=True)
         self.own = own
-        self.shown_k: int | None = None
+        self.screen: Screen | None = None
         self.switches = 0
         self._poses = 0
-        self._shown: tuple[RiggedMesh, NDArray[np.float32]] | None = None
+        self._on_screen: RiggedMesh | None = None
 
     def _show(self, k: int, mesh: RiggedMesh, motion: NDArray[np.float32]) -> None:
-        self.switches += self._shown is not None and self._shown[0] is not mesh
-        self._shown, self.shown_k = (mesh, motion), k
-
-    def picture(self, cameras: list[Camera]) -> list[Picture] | None:
-        """The mesh moved, seen by the cameras."""
-        if self._shown is None:
-            return None
-        mesh, motion = self._shown
-        vertices = animate(mesh, motion)
-        return [render(vertices, mesh.faces_drawn, mesh.mesh.surface, camera) for camera in cameras]
+        self.switches += self._on_screen is not None and self._on_screen is not mesh
+        self._on_screen = mesh
+        self.screen = Screen(k, partial(animated_picture, mesh, motion))
 
 
 class Dispose(_Animated):
@@ -204,24 +212,16 @@ class FirstMesh(LastMesh):
 class Ceiling(_Animated):
     """The newest capture, no limit: what the cameras and the mesher can do at best."""
 
-    def __init__(self, rate_bps: float, own: bool) -> None:
-        super().__init__(rate_bps, own)
-        self._newest: tuple[int, CapturedFrame] | None = None
-
     def frame(self, k: int, captured: CapturedFrame) -> None:
-        """Remembered; meshed only when looked at."""
-        self._newest, self.shown_k = (k, captured), k
+        """Shown where it was captured; meshed only when looked at."""
+        if (fitted := posed(captured, self.own)) is not None and fitted[2] >= LEAST_CONFIDENCE and captured.views:
+            self.screen = Screen(k, partial(self._picture, k, captured))
 
-    def picture(self, cameras: list[Camera]) -> list[Picture] | None:
-        """The newest frame's own mesh, where it was captured."""
-        assert self._newest is not None
-        encoded = encoded_candidate(1, *self._newest, self.own)
-        if encoded is None:
-            return None
-        mesh = mesh_of(encoded, 0).mesh
+    def _picture(self, k: int, captured: CapturedFrame, cameras: list[Camera]) -> list[Picture]:
+        encoded = encoded_candidate(1, k, captured, self.own)
+        assert encoded is not None
         still = np.tile(np.eye(3, 4, dtype=np.float32), (LINK_COUNT, 1, 1))
-        self._shown = (mesh, still)
-        return super().picture(cameras)
+        return animated_picture(mesh_of(encoded, 0).mesh, still, cameras)
 
 
 PAPER = RepositorySettings(search="threshold", hold=True)
