@@ -31,7 +31,7 @@ from sender.capture.virtual_rig import VirtualRig
 from sender.channels_out import SenderChannels
 from sender.config import SenderSettings
 from sender.fitting.body_model import BodyModel
-from sender.fitting.open_tracker import open_tracker
+from sender.fitting.open_tracker import ignored_settings, open_tracker
 from sender.fitting.outside_tracker import OutsideTracker
 from sender.fitting.particle_weights_opencl import OpenClUnavailable
 from sender.pipeline import CandidatePath, Candidates, SkeletonPath, StreamIdentity, TrackedFrame
@@ -138,6 +138,8 @@ class _Stream:
         self._timer = StageTimer(clock)
         self._statistics = RunStatistics(self._timer)
         identity = StreamIdentity(settings.person, secrets.randbits(32))
+        for sentence in ignored_settings(settings.tracking.tracker, body, settings.tracking.weights):
+            log.warning("tracker: %s", sentence)
         self._tracker = open_tracker(settings.tracking.tracker, body, settings.tracking.weights)
         self._outside = _outside_tracker(source)
         self._skeletons = self._skeleton_path(identity)

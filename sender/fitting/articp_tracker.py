@@ -1,7 +1,7 @@
 """ARTICP with global fitting as a tracker (Lien 2009 §5.1): the paper's method, kept beside the default one.
 
 The model is the initial cloud, segmented by the skeleton it started with; each cloud is fitted from where the last one
-was, without prediction. The paper starts by hand; here the start is given, or a person is looked for.
+was, without prediction. The paper starts by hand; here the start is given, or a person is looked for over frames.
 """
 
 from __future__ import annotations
@@ -19,11 +19,13 @@ from common.geometry import quaternion
 from common.geometry.point_cloud import PointCloud
 from sender.fitting.articp import CARRIER, LinkPoints, LinkState, articp, carriers_of, segmented
 from sender.fitting.body_model import BodyModel
+from sender.fitting.body_outline import NoPose
 from sender.fitting.clustered_kdtree import ClusterBins, ClusteredKdTree, build_clustered_tree
 from sender.fitting.global_fitting import GlobalFitting, LinkMoments, fit_globally, link_moments
-from sender.fitting.initial_pose import NoPose, find_initial_pose
+from sender.fitting.initial_pose_search import InitialPoseSearch
 from sender.fitting.link_icp import IcpStop, partner_distances
-from sender.fitting.tracker import MINIMUM_POINTS, FitResult, Tracker
+from sender.fitting.pose_prediction import LossTimer
+from sender.fitting.tracker import MINIMUM_POINTS, FitResult, Tracker, untrusted
 
 Array = NDArray[Any]
 
@@ -72,7 +74,8 @@ class ArticpTracker:
         self._person: _Person | None = None
         self._state: LinkState | None = None
         self._result: FitResult | None = None
-        self._good_ns = 0
+        self._loss = LossTimer(settings.lost_s)
+        self._search = InitialPoseSearch()
         self._status = "looking for a person"
 
     @property
@@ -90,11 +93,12 @@ class ArticpTracker:
         too few points is no model: the pose comes back at confidence 0, and the person is looked for."""
         if len(cloud) < MINIMUM_POINTS:
             self._status = f"{len(cloud)} points: nobody to start from"
-            return _untrusted(skeleton, pose)
+            return untrusted(FitResult(skeleton, pose, False, 0, 0.0, 0.0, 0.0))
         T = forward_kinematics(skeleton, pose).astype(np.float64)
         state = LinkState(T[:, :3, :3], np.ascontiguousarray(T[:, :3, 3]))
         self._person = _person_of(cloud, skeleton, state, self._settings)
-        self._good_ns = capture_ns
+        self._loss.seen_well(capture_ns)
+        self._search = InitialPoseSearch()
         return self._accept(cloud, state, build_clustered_tree(cloud, self._settings.bins), 0, capture_ns)
 
     def track(self, cloud: PointCloud, capture_ns: int) -> FitResult | None:
@@ -105,14 +109,14 @@ class ArticpTracker:
         if self._state is None or self._person is None:
             return self._look(cloud, capture_ns)
         result = self._follow(self._person, self._state, cloud, capture_ns)
-        if capture_ns - self._good_ns > self._settings.lost_s * 1e9:
+        if self._loss.lost(capture_ns):
             self._state = None
             self._status = "lost: looking for the person"
             return self._unseen()
         return result
 
     def _look(self, cloud: PointCloud, capture_ns: int) -> FitResult | None:
-        found = find_initial_pose(cloud)
+        found = self._search.step(cloud, capture_ns)
         if isinstance(found, NoPose):
             self._status = f"looking for a person: {found.reason}"
             return self._unseen()
@@ -145,7 +149,7 @@ class ArticpTracker:
         confidence = seen * float(inlier.mean())
         self._status = "tracking"
         if confidence >= self._settings.lost_confidence:
-            self._good_ns = capture_ns
+            self._loss.seen_well(capture_ns)
         else:
             self._status = f"unsure: {seen:.0%} of the model and {inlier.mean():.0%} of the points fit"
         self._result = FitResult(
@@ -161,9 +165,7 @@ class ArticpTracker:
 
     def _unseen(self) -> FitResult | None:
         """The last pose, not to be trusted; None when there never was one."""
-        if self._result is None:
-            return None
-        return _untrusted(self._result.skeleton, self._result.pose)
+        return None if self._result is None else untrusted(self._result)
 
 
 ARTICP_ABLATIONS: dict[str, Callable[[BodyModel | None], Tracker]] = {
@@ -196,11 +198,6 @@ def _pose_of(skeleton: Skeleton, state: LinkState, jointed: bool) -> tuple[Skele
     rotations = quaternion.from_matrix(local).astype(np.float32)
     pose = SkeletonPose(state.joints[0].astype(np.float32), rotations, np.ones(LINK_COUNT, np.float32))
     return skeleton, pose, LinkState(R, state.joints)
-
-
-def _untrusted(skeleton: Skeleton, pose: SkeletonPose) -> FitResult:
-    nothing_seen = SkeletonPose(pose.root_position, pose.rotations, np.zeros(LINK_COUNT, np.float32))
-    return FitResult(skeleton, nothing_seen, False, 0, 0.0, 0.0, 0.0)
 
 
 def _near_m(count: int) -> float:

@@ -20,6 +20,16 @@ TRACKERS: dict[str, Callable[[BodyModel | None, Callable[[], ParticleWeights]], 
 }
 
 
+def ignored_settings(name: str, body: BodyModel | None, weights: str) -> list[str]:
+    """What a tracker will not use, one sentence each, for the operator."""
+    ignored = []
+    if body is not None and name != "gauss-newton":
+        ignored.append(f'the saved body is not used: "{name}" learns no surface')
+    if weights != "numba" and name != "particles":
+        ignored.append(f'weights = "{weights}" is not used: "{name}" weighs no particles')
+    return ignored
+
+
 def open_tracker(name: str, body: BodyModel | None = None, weights: str = "numba") -> Tracker:
     """A tracker that has seen nothing yet. ``body``: a person known from before, where the tracker can use it.
     ``weights``: where particles are weighed, by a tracker that has any.

@@ -6,13 +6,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from common.body.skeleton import LINK_COUNT, NAMED_JOINT_LINKS
-from common.body.skeleton_pose import SkeletonPose
+from common.body.skeleton import NAMED_JOINT_LINKS
 from sender.capture.outside_skeleton import Instant, Sensor
 from sender.fitting.outside_pose import OutsidePose
 from sender.fitting.outside_sizes import OutsideSizes
 from sender.fitting.skeleton_merging import SEEN, SkeletonMerger
-from sender.fitting.tracker import FitResult
+from sender.fitting.tracker import FitResult, untrusted
 
 
 class OutsideTracker:
@@ -40,7 +39,7 @@ class OutsideTracker:
         self.status = f"merging sensors' skeletons: {len(instant)} of them"
         if not np.isfinite(merged.joints[self._pose.trunk_rows]).all():
             self.status = "the sensors do not see a whole trunk"
-            return None if self._last is None else _untrusted(self._last)
+            return None if self._last is None else untrusted(self._last)
         if self._merger.people != self._people:  # another person's sizes are learned from nothing
             self._sizes, self._people = OutsideSizes(self._kind), self._merger.people
         tracked = merged.confidence > SEEN
@@ -56,8 +55,3 @@ class OutsideTracker:
             confidence=float(pose.confidence[NAMED_JOINT_LINKS].mean()),
         )
         return self._last
-
-
-def _untrusted(last: FitResult) -> FitResult:
-    pose = SkeletonPose(last.pose.root_position, last.pose.rotations, np.zeros(LINK_COUNT, np.float32))
-    return FitResult(last.skeleton, pose, False, 0, 0.0, 0.0, 0.0)

@@ -23,17 +23,17 @@ from sender.fitting.body_model import BodyModel
 from sender.fitting.body_outline import NoPose
 from sender.fitting.initial_pose import find_initial_pose
 from sender.fitting.initial_pose_search import InitialPoseSearch
-from sender.fitting.joint_limits import joint_table, turned_on
+from sender.fitting.joint_limits import joint_table
 from sender.fitting.limb_search import thinned
 from sender.fitting.particle_weights import ParticleWeights, numba_weights
-from sender.fitting.tracker import MINIMUM_POINTS, FitResult
+from sender.fitting.pose_prediction import FRAME_NS, LossTimer, predicted_poses
+from sender.fitting.tracker import MINIMUM_POINTS, FitResult, untrusted
 from sender.fitting.whole_body_ellipsoids import Ellipsoids, whole_body_ellipsoids
 from sender.fitting.whole_body_fit import EllipsoidFit, fit_ellipsoids, judge_ellipsoids
 from sender.fitting.whole_body_particles import EXPECTED, WholeBodyParticles
 
 Array = NDArray[Any]
 
-FRAME_NS = 1e9 / 30.0
 SEARCH_POINTS, FIT_POINTS = 600, 1250
 HYPOTHESES = (1.0, 0.0)  # shares of the last velocity
 COARSE = Schedule(3, 0.20, 0.10, 0.0, 1.0, 1.0)
@@ -79,6 +79,7 @@ class ParticleTracker:
         self._looking_since_ns: int | None = None
         self._status = "looking for a person"
         self._result: FitResult | None = None
+        self._loss = LossTimer(settings.lost_s)
 
     @property
     def status(self) -> str:
@@ -106,7 +107,7 @@ class ParticleTracker:
         self._state: PoseState | None = state
         self._before = state
         self._times_ns = (capture_ns, capture_ns)
-        self._good_ns = capture_ns
+        self._loss.seen_well(capture_ns)
         self._usual = np.zeros(len(ellipsoids.links))
         self._confidence = pose.confidence
         return self._accept(self._polished(cloud, state, state, FINE), cloud, capture_ns)
@@ -116,15 +117,15 @@ class ParticleTracker:
         if len(cloud) < MINIMUM_POINTS:
             self._status = f"{len(cloud)} points: nobody to see"
             self._looking_since_ns = None
-            if self._skeleton is not None and capture_ns - self._good_ns > self._settings.lost_s * 1e9:
+            if self._loss.lost(capture_ns):
                 self._skeleton = None  # who comes next may be somebody else
             return self._unseen()
         if self._skeleton is None:
             return self._look(cloud, capture_ns)
         fit = self._follow(thinned(cloud, FIT_POINTS), capture_ns)
         if fit.score < self._settings.lost_score:
-            self._good_ns = capture_ns
-        elif capture_ns - self._good_ns > self._settings.lost_s * 1e9:
+            self._loss.seen_well(capture_ns)
+        elif self._loss.lost(capture_ns):
             self._skeleton = None
             self._status = "lost: looking for the person"
             return self._unseen()
@@ -158,13 +159,8 @@ class ParticleTracker:
 
     def _predicted(self, capture_ns: int) -> list[PoseState]:
         assert self._state is not None
-        past_ns = self._times_ns[0] - self._times_ns[1]
-        if past_ns <= 0:
-            return [self._state]
-        ahead = np.clip((capture_ns - self._times_ns[0]) / past_ns, 0.0, 3.0) * np.array(HYPOTHESES)
-        turns = turned_on(self._before.local, self._state.local, ahead, self._table.twist_axis)
-        roots = self._state.root + ahead[:, None] * (self._state.root - self._before.root)
-        return [PoseState(root, local) for root, local in zip(roots, turns, strict=True)]
+        axis = self._table.twist_axis
+        return predicted_poses(self._state, self._before, self._times_ns, capture_ns, HYPOTHESES, axis)
 
     def _polished(self, cloud: PointCloud, start: PoseState, predicted: PoseState, plan: Schedule) -> EllipsoidFit:
         points, normals = cloud.positions, cloud.normals
@@ -213,8 +209,4 @@ class ParticleTracker:
 
     def _unseen(self) -> FitResult | None:
         """The last pose, not to be trusted; None when there never was one."""
-        if self._result is None:
-            return None
-        last = self._result
-        pose = SkeletonPose(last.pose.root_position, last.pose.rotations, np.zeros(LINK_COUNT, np.float32))
-        return FitResult(last.skeleton, pose, False, 0, 0.0, 0.0, 0.0)
+        return None if self._result is None else untrusted(self._result)

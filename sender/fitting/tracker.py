@@ -5,7 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Protocol
 
-from common.body.skeleton import Skeleton
+import numpy as np
+
+from common.body.skeleton import LINK_COUNT, Skeleton
 from common.body.skeleton_pose import SkeletonPose
 from common.geometry.point_cloud import PointCloud
 from sender.fitting.body_model import BodyModel
@@ -38,3 +40,9 @@ class Tracker(Protocol):
     def body(self) -> BodyModel | None: ...
     def start_from(self, skeleton: Skeleton, pose: SkeletonPose, cloud: PointCloud, capture_ns: int) -> FitResult: ...
     def track(self, cloud: PointCloud, capture_ns: int) -> FitResult | None: ...
+
+
+def untrusted(last: FitResult) -> FitResult:
+    """The last pose when nothing was seen of it: no joint is to be trusted."""
+    pose = SkeletonPose(last.pose.root_position, last.pose.rotations, np.zeros(LINK_COUNT, np.float32))
+    return FitResult(last.skeleton, pose, False, 0, 0.0, 0.0, 0.0)
