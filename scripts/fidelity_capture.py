@@ -18,6 +18,7 @@ from scripts.capture_files import CapturedFrame, load_frames, save_frames
 from scripts.fidelity import Picture, measuring_cameras
 from scripts.true_skeleton import TrueSkeleton
 from sender.capture.frame_set import DepthFrame
+from sender.capture.fundamental_poses import FUNDAMENTAL_S, PREFIX
 from sender.capture.performer import Performer, open_performer
 from sender.capture.rig_layout import RigSettings
 from sender.capture.rig_process import RigRenderer
@@ -33,11 +34,13 @@ TRUTHS_KEPT = 64  # of 10 MB
 
 
 class Capture:
-    """A performance in memory; ``frame(k)`` is the k-th frame of a session of any length."""
+    """A performance in memory; ``frame(k)`` is the k-th frame of a session of any length, of which ``once_s`` are
+    played once and the rest repeats."""
 
-    def __init__(self, performer: Performer, frames: list[CapturedFrame]) -> None:
+    def __init__(self, performer: Performer, frames: list[CapturedFrame], once_s: float = START_S) -> None:
         self.performer = performer
         self._frames = frames
+        self._once = round(once_s * FRAME_RATE_HZ)
         self._truth: dict[int, list[Picture]] = {}
 
     @property
@@ -47,7 +50,7 @@ class Capture:
 
     def index(self, k: int) -> int:
         """Which captured frame is the k-th of a session."""
-        once, all_frames = int(START_S * FRAME_RATE_HZ), len(self._frames)
+        once, all_frames = self._once, len(self._frames)
         return k if k < all_frames else once + (k - all_frames) % (all_frames - once)
 
     def frame(self, k: int) -> CapturedFrame:
@@ -78,7 +81,7 @@ def capture(
     kept: Path | None = None,
 ) -> Capture:
     """Render, cut out and track ``seconds`` of a performance (at most until it repeats), or load what was ``kept`` in a
-    folder of that name when it was captured last.
+    folder of that name when it was captured last. Fundamental poses come before those seconds.
 
     Raises:
         CaptureError: no such body or motion.
@@ -86,13 +89,14 @@ def capture(
     performer = open_performer(body, motion, data)
     renderer = RigRenderer(performer, RigSettings(cameras=cameras))
     folder = None if kept is None else kept / f"{body}-{motion or 'routine'}-{cameras}-{seconds:g}s"
+    once_s = START_S + (FUNDAMENTAL_S if (motion or "").startswith(PREFIX) else 0)
     frames = None if folder is None else load_frames(folder, renderer.cameras)
     if frames is None:
-        count = int(min(seconds, performer.duration_s + START_S) * FRAME_RATE_HZ)
+        count = int(min(seconds + once_s - START_S, performer.duration_s + START_S) * FRAME_RATE_HZ)
         frames = _captured(performer, renderer, count, progress or (lambda _: None))
         if folder is not None:
             save_frames(folder, frames, renderer.cameras)
-    return Capture(performer, frames)
+    return Capture(performer, frames, once_s)
 
 
 def _captured(

@@ -57,7 +57,7 @@ def yang(views: Sequence[View], rung: Rung) -> tuple[int, Callable[[], TriangleM
     decoded = []
     for view in (reduced(view, rung.step) for view in views):
         steps = (view.depth_mm + rung.depth // 2) // rung.depth
-        size += len(zlib.compress(np.diff(steps.astype(np.int16), axis=1, prepend=np.int16(0)).tobytes(), 9))
+        size += len(zlib.compress(np.diff(steps.astype(np.int16), axis=1, prepend=np.int16(0)).tobytes(), 6))
         jpeg, colour = _jpeg(_filled(view.colour, steps > 0), rung.quality)
         size += jpeg
         decoded.append(replace(view, depth_mm=np.asarray(steps * rung.depth, np.uint16), colour=colour))

@@ -6,7 +6,7 @@ overshoot), so nothing starts or stops with a jerk.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,11 +47,11 @@ def _left(**angles: float) -> Pose:
 
 
 _WAVE = {**_right(lower=-15, across=25, roll=-85, elbow=75), "look": -8}
-_FOLDED = {
+FOLDED = {
     **_left(lower=74, swing=36, roll=78, elbow=104),
     **_right(lower=74, swing=25, roll=72, elbow=106),
 }
-_SQUAT = {**_both(flex=95, knee=100, swing=80, lower=82, elbow=5, out=6), "lean": 28, "bend": 12, "nod": -25}
+SQUAT = {**_both(flex=95, knee=100, swing=80, lower=82, elbow=5, out=6), "lean": 28, "bend": 12, "nod": -25}
 _STEPPING = {"flex": 32.0, "knee": 55.0, "flat": 0.4}  # a leg in the air
 _KICKER = {"left_out": -3.0, "left_weight": 1.0, "right_flat": 0.1}
 _SIDE_LEFT = {**_both(out=14), "left_weight": 0.5}
@@ -81,11 +81,11 @@ def _keys() -> list[tuple[float, Pose]]:
         (6.4, _both(lower=0, swing=0, elbow=0)),
         (7.4, _both(lower=0, swing=0, elbow=0)),
         (8.6, {}),
-        (9.6, _FOLDED),
-        (10.9, _FOLDED),
+        (9.6, FOLDED),
+        (10.9, FOLDED),
         (11.9, {}),
-        (13.1, _SQUAT),
-        (13.5, _SQUAT),
+        (13.1, SQUAT),
+        (13.5, SQUAT),
         (14.7, {}),
         *_turn(),
         (20.2, {**_left(**_STEPPING), "left_out": 16, "left_weight": 0}),
@@ -114,9 +114,16 @@ def _keys() -> list[tuple[float, Pose]]:
 
 
 def routine() -> MotionClip:
-    """The routine as a cyclic clip at 60 frames/s, with the weight on each foot instead of a path."""
-    times = np.arange(round(ROUTINE_S * _RATE_HZ) + 1) / _RATE_HZ
-    angles = _angles(times)
+    """The routine as a clip."""
+    turned = {"yaw": 360.0}  # after the turn: not back again
+    return keyed_clip([(time, (turned if time > _TURN_END_S else {}) | dict(pose)) for time, pose in _keys()])
+
+
+def keyed_clip(keys: Sequence[tuple[float, Pose]]) -> MotionClip:
+    """A clip through ``keys``, each a time [s] and what differs from standing there, in order; it must begin and end
+    standing: it is cyclic, at 60 frames/s, with the weight on each foot instead of a path."""
+    times = np.arange(round(keys[-1][0] * _RATE_HZ) + 1) / _RATE_HZ
+    angles = _angles(times, keys)
     bones = _rotations(angles)
     names = tuple(bones)
     weight = np.clip(angles["left_weight"], 0, 1)
@@ -131,14 +138,12 @@ def routine() -> MotionClip:
     )
 
 
-def _angles(times: Floats) -> dict[str, Floats]:
+def _angles(times: Floats, keys: Sequence[tuple[float, Pose]]) -> dict[str, Floats]:
     """Every angle (F,) [degrees] at times (F,) [s]; breathing and a small sway on top of the keys."""
-    keys = _keys()
     at = [time for time, _ in keys]
-    turned = {"yaw": 360.0}  # after the turn: not back again
-    poses = [_STAND | (turned if time > _TURN_END_S else {}) | dict(pose) for time, pose in keys]
+    poses = [_STAND | dict(pose) for _, pose in keys]
     angles = {name: PchipInterpolator(at, [pose[name] for pose in poses])(times) for name in _STAND}
-    phase = 2 * np.pi * times / ROUTINE_S
+    phase = 2 * np.pi * times / ROUTINE_S  # of the routine; a clip of another length sways as slowly
     angles["bend"] += 0.8 * np.sin(8 * phase)  # a breath every 3.75 s
     angles["side"] += 1.2 * np.sin(5 * phase)
     angles["look"] += 5.0 * np.sin(3 * phase)

@@ -12,11 +12,14 @@ from sender.capture.body_performer import BodyPerformer
 from sender.capture.builtin_body import BUILTIN, builtin_body
 from sender.capture.choreography import routine
 from sender.capture.frame_set import CaptureError
+from sender.capture.fundamental_poses import PREFIX, fundamental_poses, joined
 from sender.capture.mocap import read_clip
 from sender.capture.retarget import retarget
 from sender.capture.skinned_body import PerformerMesh, SkinnedBody, load_body
 
 __all__ = ["Performer", "PerformerMesh", "open_performer"]
+
+ROUTINE = "routine"
 
 
 class Performer(Protocol):
@@ -45,7 +48,8 @@ def open_performer(
     """The performer ``name`` in ``motion``.
 
     ``name``: "builtin" or a body of ``data``/bodies. ``motion``: a clip of ``data``/mocap, or None for the built-in
-    routine (30 s: wave, T-pose, fold arms, squat, turn, steps, kick). ``on_the_spot``: clips that travel metres are
+    routine (30 s: wave, T-pose, fold arms, squat, turn, steps, kick); "dispose12+" and a clip, or "routine": the twelve
+    fundamental poses first. ``on_the_spot``: clips that travel metres are
     kept where cameras see them.
 
     Raises:
@@ -54,9 +58,14 @@ def open_performer(
     body = builtin_body() if name == BUILTIN else _body_of(name, data)
     if motion is None:
         return BodyPerformer(body, retarget(body, routine()), name)
-    if data is None:
-        raise CaptureError(f"motion {motion!r} needs a data folder with mocap/clips.json")
-    return BodyPerformer(body, retarget(body, read_clip(data / "mocap", motion), on_the_spot), f"{name}/{motion}")
+    free = motion.removeprefix(PREFIX)
+    if free != ROUTINE and data is None:
+        raise CaptureError(f"motion {free!r} needs a data folder with mocap/clips.json")
+    clip = routine() if data is None or free == ROUTINE else read_clip(data / "mocap", free)
+    track = retarget(body, clip, on_the_spot)
+    if motion != free:
+        track = joined(retarget(body, fundamental_poses()), track)
+    return BodyPerformer(body, track, f"{name}/{motion}")
 
 
 def _body_of(name: str, data: Path | None) -> SkinnedBody:
