@@ -12,9 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from common.body.rigged_mesh import RiggedMesh
-from common.body.skeleton import LINK_COUNT, Skeleton
+from common.body.skeleton import LINK_COUNT, LINK_INDEX, SIDES, Skeleton
 from common.body.skeleton_pose import SkeletonPose, forward_kinematics
 from common.body.skinning import animate, link_motion
+from common.geometry import quaternion
 from common.geometry.camera_model import Camera
 from common.geometry.rasterizer import render
 from common.runtime.stage_timer import StageTimer
@@ -33,6 +34,7 @@ from sender.pipeline import CandidatePath, StreamIdentity, TrackedFrame
 
 CANDIDATE_EVERY = 6  # frames: 200 ms, as in the sender
 LEAST_CONFIDENCE = 0.5
+WRONG_SHARE, WRONG_BY_RAD = 0.2, 0.35  # of the candidates; at the shoulder: 12 to 20 cm at a stretched arm's wrist
 DEPTH_STEP_MM, JPEG_QUALITY = 2, 85
 
 
@@ -123,7 +125,7 @@ class Dispose(_Animated):
         fitted = posed(captured, self.own)
         self.link.start_frame()
         if fitted is not None:
-            tracked = _tracked(k, captured, fitted)
+            tracked = self._candidate(k, captured, fitted)
             self._candidates.remember(tracked)
             if k % CANDIDATE_EVERY == 0 and self._candidates.may_become_one(tracked):
                 self._candidates.note_budget(self._scheduler.budget_bytes)
@@ -132,6 +134,9 @@ class Dispose(_Animated):
         self._carry(k)
         if fitted is not None:
             self._animate(k, fitted)
+
+    def _candidate(self, k: int, captured: CapturedFrame, fitted: tuple[Skeleton, SkeletonPose, float]) -> TrackedFrame:
+        return _tracked(k, captured, fitted)
 
     def _carry(self, k: int) -> None:
         while True:
@@ -167,6 +172,28 @@ def _tracked(k: int, captured: CapturedFrame, fitted: tuple[Skeleton, SkeletonPo
     fit = FitResult(skeleton, pose, True, 1, 1.0, 0.0, confidence)
     T_world_link = forward_kinematics(skeleton, pose)
     return TrackedFrame(k * FRAME_NS, captured.views, fit, skeleton=skeleton, pose=pose, T_world_link=T_world_link)
+
+
+class DisposeMistold(Dispose):
+    """As ``Dispose``, with a fifth of the candidates' skeletons wrong: an arm is said to be elsewhere, its hand more
+    than 5 cm away (DISPOSE §8). ``told``: their fit says that it is doubtful. What is shown follows the right ones."""
+
+    def __init__(self, rate_bps: float, own: bool, told: bool) -> None:
+        super().__init__(rate_bps, own)
+        self._told = told
+        self._random = np.random.default_rng(0)
+
+    def _candidate(self, k: int, captured: CapturedFrame, fitted: tuple[Skeleton, SkeletonPose, float]) -> TrackedFrame:
+        skeleton, pose, confidence = fitted
+        if self._random.random() < WRONG_SHARE:
+            side = SIDES[int(self._random.integers(2))]
+            turn = quaternion.from_rotation_vector(self._random.choice([-1, 1], 3) * WRONG_BY_RAD / np.sqrt(3))
+            rotations = pose.rotations.copy()
+            link = LINK_INDEX[f"{side}_upper_arm"]
+            rotations[link] = quaternion.multiply(rotations[link].astype(np.float64), turn)
+            pose = SkeletonPose(pose.root_position, rotations, pose.confidence)
+            confidence = 0.2 if self._told else confidence
+        return _tracked(k, captured, (skeleton, pose, confidence))
 
 
 class LastMesh(_Animated):
@@ -229,6 +256,8 @@ METHODS: dict[str, Callable[[float, bool], Method]] = {
     "dispose": Dispose,
     "dispose-paper": lambda rate, own: Dispose(rate, own, PAPER, "paper"),
     "dispose-paper-sender": lambda rate, own: Dispose(rate, own, choice="paper"),
+    "dispose-mistold": lambda rate, own: DisposeMistold(rate, own, told=False),
+    "dispose-doubted": lambda rate, own: DisposeMistold(rate, own, told=True),
     "dispose-paper-receiver": lambda rate, own: Dispose(rate, own, PAPER),
     "last-mesh": LastMesh,
     "first-mesh": FirstMesh,

@@ -1,0 +1,234 @@
+"""What choosing costs: σ per pose, both searches over repository size, animation, and keeping χ and coverage.
+
+Poses are captured from the built-in performer's routine by four virtual cameras; repositories larger than what was
+captured hold it several times, each copy in memory of its own. Times are the fastest of many, to be told apart from
+whatever else the machine does. ``--pictures DIR`` draws DISPOSE's Figs. 6 and 7 anew.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from common.body.body_regions import default_region_weights
+from common.body.distortion_score import SessionThreshold, distortion_scores
+from common.body.joint_edge_store import JointEdgeStore
+from common.body.rigged_mesh import RiggedMesh
+from common.body.skeleton_pose import forward_kinematics
+from common.body.skinning import Skinning, animate, link_motion
+from common.geometry.rasterizer import render
+from receiver.pipeline import mesh_of
+from receiver.repository.pose_repository import PoseRepository, RepositorySettings
+from receiver.repository.pose_selection import PoseSelector, SelectionSettings
+from scripts.fidelity import measuring_cameras
+from scripts.fidelity_capture import Capture, capture, show_progress
+from scripts.fidelity_methods import encoded_candidate
+from scripts.line_chart import line_chart
+from scripts.run_bench import Row
+from sender.candidate_poses.pose_coverage import CoverageSet
+
+CAPTURED_S = 14.0
+POSE_EVERY = 8  # frames
+SIZES = (1, 5, 10, 19, 50, 100, 200, 500, 1000)  # of a repository; 19 is where the paper's exhaustive search ends
+GOAL_VERTICES = 46_000  # of the goal for σ; its joint edges grow as the root of the vertices
+RUNS, FRAMES = 40, 20
+_SKINNINGS: tuple[Skinning, ...] = ("rigid", "linear", "spherical")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Material:
+    meshes: list[RiggedMesh]
+    largest: RiggedMesh
+    targets: NDArray[np.float32]  # (N, L, 4, 4)
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """This bench's own options."""
+    parser.add_argument("--captures", type=Path, help="folder where captured motions are kept for the next time")
+    parser.add_argument("--pictures", type=Path, help="folder for curves and pictures")
+
+
+def run(
+    data: Path | None, seconds: float | None, clips: tuple[str, ...], captures: Path | None, pictures: Path | None
+) -> Iterator[Row]:
+    """Rows of the built-in routine, or of the first of ``clips`` on ``male_avg``."""
+    motion = clips[0] if clips else None
+    body = "male_avg" if motion else "builtin"
+    recorded = capture(body, motion, data, 4, seconds or CAPTURED_S, show_progress("capturing"), captures)
+    material = _material(recorded)
+    case = f"{body}/{motion or 'routine'}/4"
+    yield from _costs(case, material)
+    exhaustive, threshold = _searches(material)
+    yield _row(case, "exhaustive_ms_at_1000", exhaustive[1000], "ms", None, "paper: 19 poses are too many")
+    yield _row(case, "exhaustive_ms_at_200", exhaustive[200], "ms")
+    yield _row(case, "threshold_ms_at_200", threshold[200], "ms", 33.0, "DISPOSE §8: 30 fps at about 200 poses")
+    gaps = _gaps(material)
+    yield _row(case, "exhaustive_vs_threshold_gap_max", float(gaps.max()), "1", 0.12, "DISPOSE §7.1.1")
+    yield _row(case, "exhaustive_vs_threshold_gap_mean", float(gaps.mean()), "1")
+    if pictures is not None:
+        pictures.mkdir(parents=True, exist_ok=True)
+        _draw_searches(pictures / "search-time.svg", exhaustive, threshold)
+        _draw_scores(pictures / "rising-score.png", material, recorded)
+
+
+def _material(recorded: Capture) -> _Material:
+    count = recorded.length
+    meshes = []
+    for pose_id, k in enumerate(range(0, count, POSE_EVERY), start=1):
+        encoded = encoded_candidate(pose_id, k, recorded.frame(k), own=False)
+        assert encoded is not None
+        meshes.append(mesh_of(encoded, 0).mesh)
+    targets = np.stack([forward_kinematics(*recorded.frame(k).true) for k in range(count)])
+    return _Material(meshes, max(meshes, key=lambda mesh: len(mesh.mesh.vertices)), targets)
+
+
+def _costs(case: str, material: _Material) -> Iterator[Row]:
+    weights = default_region_weights()
+    mesh, targets = material.largest, material.targets
+    edges = mesh.joint_edges
+    size = f"{len(mesh.mesh.vertices)} vertices, {len(edges)} joint edges"
+    hundred = JointEdgeStore(weights)
+    for pose_id in range(100):
+        hundred.add(pose_id, material.meshes[pose_id % len(material.meshes)].joint_edges)
+    ids = list(range(100))
+    sigma_us = _fastest_ms(lambda: hundred.scores(ids, targets[0])) * 10
+    finer = (GOAL_VERTICES / len(mesh.mesh.vertices)) ** 0.5
+    yield _row(case, "sigma_us_per_pose", sigma_us, "µs", None, size)
+    yield _row(case, "sigma_us_per_pose_46k", sigma_us * finer, "µs", None, f"scaled by {finer:.2f}")
+    buffered = np.resize(targets, (300, *targets.shape[1:]))
+    chi_ms = _fastest_ms(lambda: distortion_scores(edges, buffered, weights))
+    yield _row(case, "chi_update_ms", chi_ms, "ms", None, "σ of a new pose for 300 skeletons")
+    yield _row(case, "skeleton_update_ms", _skeleton_update_ms(material), "ms", None, "a new skeleton, 100 poses")
+    motion = link_motion(mesh, targets[len(targets) // 2])
+    per_vertex = 50_000 / len(mesh.mesh.vertices)
+    for skinning in _SKINNINGS:
+
+        def animated(skinning: Skinning = skinning) -> None:
+            _vertex_normals(animate(mesh, motion, skinning), mesh.faces_drawn)
+
+        figure = _fastest_ms(animated) * per_vertex
+        yield _row(case, f"animate_ms_50k/{skinning}", figure, "ms", 5.0, f"with normals, scaled from {size}")
+
+
+def _skeleton_update_ms(material: _Material) -> float:
+    coverage = CoverageSet()
+    for pose_id in range(100):
+        mesh = material.meshes[pose_id % len(material.meshes)]
+        coverage.add_pose(replace(mesh, pose_id=pose_id))
+    times = iter(range(0, 10**15, 10**9))
+    return _fastest_ms(lambda: coverage.add_skeleton(next(times), material.targets[0]))
+
+
+def _searches(material: _Material) -> tuple[dict[int, float], dict[int, float]]:
+    """Milliseconds a frame of both searches, by size of the repository: mean over the motion."""
+    frames = material.targets[:: max(1, len(material.targets) // FRAMES)]
+    repositories = {size: _repository(material.meshes, size) for size in SIZES}
+
+    def times(settings: SelectionSettings) -> dict[int, float]:
+        return {size: _search_ms(repository, settings, frames) for size, repository in repositories.items()}
+
+    return times(SelectionSettings()), times(SelectionSettings(search="threshold", hold=True))
+
+
+def _search_ms(repository: PoseRepository, settings: SelectionSettings, frames: NDArray[np.float32]) -> float:
+    selector = PoseSelector(settings)
+    for _ in range(3):  # the threshold finds its level
+        for target in frames:
+            selector.select(repository, target)
+    if settings.search == "exhaustive":  # it costs the same in every frame
+        return min(_fastest_ms(partial(selector.select, repository, target), 4) for target in frames)
+    return float(np.mean([_fastest_ms(partial(selector.select, repository, target), 4) for target in frames]))
+
+
+def _repository(meshes: list[RiggedMesh], size: int) -> PoseRepository:
+    """``size`` poses of those captured, spread over the motion, again and again."""
+    repository = PoseRepository(RepositorySettings(max_poses=size, max_bytes=1 << 40, equal_share=0.0))
+    order = np.resize(np.random.default_rng(0).permutation(len(meshes)), size)
+    for pose_id, index in enumerate(order.tolist()):
+        repository.add(replace(meshes[index], pose_id=pose_id), 1, 0.0)
+    return repository
+
+
+def _gaps(material: _Material) -> NDArray[np.float64]:
+    """By how much σ of what the threshold search chooses (no hold, threshold known) is above the best σ, by frame."""
+    repository = _repository(material.meshes[::2], len(material.meshes[::2]))
+    ids = repository.by_use()
+    best = np.array([repository.scores(ids, target).min() for target in material.targets])
+    threshold = SessionThreshold()
+    for sigma in best:
+        threshold.follow(float(sigma))
+    chosen = [repository.scores(ids, target, threshold.value) for target in material.targets]
+    return np.array([float(sigmas.min()) for sigmas in chosen], np.float64) - best
+
+
+def _draw_searches(file: Path, exhaustive: dict[int, float], threshold: dict[int, float]) -> None:
+    """DISPOSE Fig. 7: time of both searches over the number of poses."""
+    lines = {
+        "exhaustive": (list(exhaustive), list(exhaustive.values())),
+        "threshold and hold": (list(threshold), list(threshold.values())),
+    }
+    file.write_text(line_chart("Searching a repository", "poses", "ms a frame", lines, ("10 ms", 10.0), dots=True))
+
+
+def _draw_scores(file: Path, material: _Material, recorded: Capture) -> None:
+    """DISPOSE Fig. 6: one posture from poses of rising σ."""
+    k = recorded.length // 2
+    target = material.targets[k]
+    weights = default_region_weights()
+    sigmas = [float(distortion_scores(mesh.joint_edges, target[None], weights)[0]) for mesh in material.meshes]
+    order = np.argsort(sigmas)
+    camera = measuring_cameras(recorded.performer.surface(recorded.frame(k).time_s))[0]
+    pictures = []
+    for rank in np.linspace(0, len(order) - 1, 8).astype(int):
+        mesh = material.meshes[order[rank]]
+        colour, _ = render(animate(mesh, link_motion(mesh, target)), mesh.faces_drawn, mesh.mesh.surface, camera)
+        picture = np.ascontiguousarray(colour[:, 110:-110])
+        text = f"{sigmas[order[rank]]:.2f}"
+        cv2.putText(picture, text, (8, 28), cv2.FONT_HERSHEY_SIMPLEX, 0.8, (0, 0, 0), 2, cv2.LINE_AA)
+        pictures.append(picture)
+    cv2.imwrite(str(file), cv2.cvtColor(np.concatenate(pictures, axis=1), cv2.COLOR_RGB2BGR))
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _vertex_normals(vertices, faces):  # type: ignore[no-untyped-def]
+    """Unit normals (V, 3), as a lit renderer would need them: the sum of the triangles' around each vertex."""
+    out = np.zeros_like(vertices)
+    for f in range(len(faces)):
+        a, b, c = vertices[faces[f, 0]], vertices[faces[f, 1]], vertices[faces[f, 2]]
+        ux, uy, uz = b[0] - a[0], b[1] - a[1], b[2] - a[2]
+        vx, vy, vz = c[0] - a[0], c[1] - a[1], c[2] - a[2]
+        x, y, z = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
+        for k in range(3):
+            n = out[faces[f, k]]
+            n[0] += x
+            n[1] += y
+            n[2] += z
+    for v in range(len(out)):
+        n = out[v]
+        length = np.sqrt(n[0] * n[0] + n[1] * n[1] + n[2] * n[2])
+        if length > 0:
+            n /= length
+    return out
+
+
+def _fastest_ms(action: Callable[[], object], runs: int = RUNS) -> float:
+    action()
+    best = float("inf")
+    for _ in range(runs):
+        begun = time.perf_counter()
+        action()
+        best = min(best, time.perf_counter() - begun)
+    return best * 1e3
+
+
+def _row(case: str, metric: str, value: float, unit: str, reference: float | None = None, source: str = "") -> Row:
+    return Row(case=case, metric=metric, value=value, unit=unit, reference=reference, source=source)
