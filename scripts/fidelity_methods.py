@@ -31,6 +31,7 @@ from sender.candidate_poses.mesh_scheduler import MeshScheduler
 from sender.config import CandidateSettings
 from sender.fitting.tracker import FitResult
 from sender.pipeline import CandidatePath, StreamIdentity, TrackedFrame
+from sender.reconstruction.depth_fusion import DepthFusion, PosedViews
 
 CANDIDATE_EVERY = 6  # frames: 200 ms, as in the sender
 LEAST_CONFIDENCE = 0.5
@@ -64,12 +65,17 @@ def posed(captured: CapturedFrame, own: bool) -> tuple[Skeleton, SkeletonPose, f
     return captured.own if own else (*captured.true, 1.0)
 
 
-def encoded_candidate(pose_id: int, k: int, captured: CapturedFrame, own: bool) -> bytes | None:
-    """The candidate pose of a frame, or None when its skeleton is doubtful or nobody is seen."""
+def encoded_candidate(
+    pose_id: int, k: int, captured: CapturedFrame, own: bool, fusion: DepthFusion | None = None
+) -> bytes | None:
+    """The candidate pose of a frame, or None when its skeleton is doubtful or nobody is seen. Its depth is fused with
+    that of the frames ``fusion`` remembers."""
     fitted = posed(captured, own)
     if fitted is None or fitted[2] < LEAST_CONFIDENCE or not captured.views:
         return None
-    candidate = CandidatePose(pose_id, 0, 1, k * FRAME_NS, fitted[0], fitted[1], captured.views)
+    posed_views = PosedViews(k * FRAME_NS, captured.views, forward_kinematics(fitted[0], fitted[1]))
+    views = captured.views if fusion is None else fusion.fused(posed_views, fitted[0])
+    candidate = CandidatePose(pose_id, 0, 1, k * FRAME_NS, fitted[0], fitted[1], views)
     return encode_candidate_pose(candidate, JPEG_QUALITY, DEPTH_STEP_MM)
 
 
@@ -94,6 +100,14 @@ class _Animated:
         self.switches = 0
         self._poses = 0
         self._on_screen: RiggedMesh | None = None
+        self._fusion = DepthFusion(CandidateSettings().fused_frames)
+
+    def _remember(self, k: int, captured: CapturedFrame) -> None:
+        """For the depth of the frames to come, as the sender does."""
+        fitted = posed(captured, self.own)
+        if fitted is not None and fitted[2] >= LEAST_CONFIDENCE:
+            T_world_link = forward_kinematics(fitted[0], fitted[1])
+            self._fusion.remember(PosedViews(k * FRAME_NS, captured.views, T_world_link))
 
     def _show(self, k: int, mesh: RiggedMesh, motion: NDArray[np.float32]) -> None:
         self.switches += self._on_screen is not None and self._on_screen is not mesh
@@ -205,10 +219,11 @@ class LastMesh(_Animated):
 
     def frame(self, k: int, captured: CapturedFrame) -> None:
         """Whenever the link is free, the newest frame's mesh goes out."""
+        self._remember(k, captured)
         self.link.start_frame()
         while True:
             if self.link.idle:
-                encoded = encoded_candidate(self._poses + 1, k, captured, self.own)
+                encoded = encoded_candidate(self._poses + 1, k, captured, self.own, self._fusion)
                 if encoded is None:
                     break
                 self._poses += 1
@@ -241,11 +256,12 @@ class Ceiling(_Animated):
 
     def frame(self, k: int, captured: CapturedFrame) -> None:
         """Shown where it was captured; meshed only when looked at."""
+        self._remember(k, captured)
         if (fitted := posed(captured, self.own)) is not None and fitted[2] >= LEAST_CONFIDENCE and captured.views:
             self.screen = Screen(k, partial(self._picture, k, captured))
 
     def _picture(self, k: int, captured: CapturedFrame, cameras: list[Camera]) -> list[Picture]:
-        encoded = encoded_candidate(1, k, captured, self.own)
+        encoded = encoded_candidate(1, k, captured, self.own, self._fusion)
         assert encoded is not None
         still = np.tile(np.eye(3, 4, dtype=np.float32), (LINK_COUNT, 1, 1))
         return animated_picture(mesh_of(encoded, 0).mesh, still, cameras)

@@ -68,9 +68,10 @@ class TrackingSettings:
 class CandidateSettings:
     """Candidate poses. ``choice``: what is sent next, by "coverage" or by the "paper"'s χ. ``interval_ms``: time
     between two that are considered. ``least_confidence``: of a fit, for its frame to become one. ``jpeg_quality``,
-    ``depth_step_mm``: how finely a view is sent; the ``thin_`` ones where a pose would take long. ``send_log``: a file
-    that gets a JSON line for every send. ``segmentation``: what belongs to which link. ``region_weights``: ω where it
-    is not the default; ``score_form``: what σ divides by."""
+    ``depth_step_mm``: how finely a view is sent; the ``thin_`` ones where a pose would take long. ``send_log``: a
+    file that gets a JSON line for every send. ``fused_frames``: so many frames are averaged into a pose's depth.
+    ``segmentation``: what belongs to which link. ``region_weights``: ω where it is not the default; ``score_form``:
+    what σ divides by."""
 
     enabled: bool = True
     choice: Literal["coverage", "paper"] = "coverage"
@@ -80,6 +81,7 @@ class CandidateSettings:
     depth_step_mm: int = 2
     thin_jpeg_quality: int = 50
     thin_depth_step_mm: int = 8
+    fused_frames: int = 4
     segmentation: Segmentation = "voronoi"
     region_weights: dict[str, float] = field(default_factory=lambda: dict(DEFAULT_WEIGHTS))
     score_form: ScoreForm = "joining-edges"
@@ -96,6 +98,8 @@ class CandidateSettings:
         for name in ("depth_step_mm", "thin_depth_step_mm"):
             if not 1 <= getattr(self, name) <= 16:
                 raise ValueError(f"{name}: {getattr(self, name)} is outside 1..16")
+        if not 0 <= self.fused_frames <= 30:
+            raise ValueError(f"fused_frames: {self.fused_frames} is outside 0..30")
         region_weights(self.region_weights)
 
 

@@ -31,6 +31,7 @@ from sender.config import CandidateSettings
 from sender.fitting.outside_tracker import OutsideTracker
 from sender.fitting.start_joints import skeleton_from_joints
 from sender.fitting.tracker import MINIMUM_POINTS, FitResult, Tracker
+from sender.reconstruction.depth_fusion import DepthFusion, PosedViews
 from sender.reconstruction.person_points import Reconstruction
 
 FINE_BYTES = 80_000  # of a pose sent finely, before one was
@@ -187,6 +188,8 @@ class CandidatePath:
         self._budget_bytes: int | None = None
         self._fine_bytes = FINE_BYTES
         self._skeletons: deque[tuple[int, NDArray[np.float32]]] = deque(maxlen=SKELETONS_WAITING)
+        self._fusion = DepthFusion(settings.fused_frames)
+        self._seen: deque[PosedViews] = deque(maxlen=settings.fused_frames + 1)
         self._sent: deque[tuple[int, float]] = deque(maxlen=SENDS_WAITING)
 
     def may_become_one(self, tracked: TrackedFrame) -> bool:
@@ -202,6 +205,7 @@ class CandidatePath:
         fit = tracked.fit
         if tracked.T_world_link is not None and fit is not None and fit.confidence >= self._settings.least_confidence:
             self._skeletons.append((tracked.capture_ns, tracked.T_world_link))
+            self._seen.append(PosedViews(tracked.capture_ns, tracked.views, tracked.T_world_link))
 
     def note_budget(self, bytes_per_s: int | None) -> None:
         """What the thinnest link to a receiver can carry; None while there is none."""
@@ -216,8 +220,10 @@ class CandidatePath:
 
         The mesh is built from the encoded views, as the receiver will build it, so both ends judge the same one.
         """
+        with self._timer.stage("depth fusion"):
+            views = self._fused(tracked)
         with self._timer.stage("encode views"):
-            candidate = self._candidate(tracked)
+            candidate = self._candidate(tracked, views)
             encoded = self._encode(candidate)
             preview = encode_preview(candidate)
         with self._timer.stage("candidate mesh"):
@@ -250,7 +256,16 @@ class CandidatePath:
         self._fine_bytes = len(encoded)
         return encoded
 
-    def _candidate(self, tracked: TrackedFrame) -> CandidatePose:
+    def _fused(self, tracked: TrackedFrame) -> tuple[View, ...]:
+        """The frame's views, their depth averaged with the last frames'."""
+        while self._seen:
+            self._fusion.remember(self._seen.popleft())
+        assert tracked.skeleton is not None
+        assert tracked.T_world_link is not None
+        posed = PosedViews(tracked.capture_ns, tracked.views, tracked.T_world_link)
+        return self._fusion.fused(posed, tracked.skeleton)
+
+    def _candidate(self, tracked: TrackedFrame, views: tuple[View, ...]) -> CandidatePose:
         assert tracked.skeleton is not None
         assert tracked.fit is not None
         self._poses += 1
@@ -261,7 +276,7 @@ class CandidatePath:
             capture_ns=tracked.capture_ns,
             skeleton=tracked.skeleton,
             pose=tracked.fit.pose,  # not the quantised one: rounding twice could end elsewhere than the packet's
-            views=tracked.views,
+            views=views,
             rigging=Rigging(self._settings.segmentation),
         )
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from common.body.mannequin import mannequin, mannequin_camera, mannequin_depth
@@ -113,9 +115,10 @@ def rehearse_candidates() -> None:
     views = (_view(mannequin_camera()),)
     tracked = TrackedFrame(0, views, fit, skeleton=skeleton, pose=pose, T_world_link=T_world_link)
     candidates = CandidatePath(_IDENTITY, CandidateSettings(), StageTimer(MonotonicClock()))
-    for _ in range(2):  # the second meets the first in the usable pose set
-        candidates.remember(tracked)
-        candidates.process(tracked)
+    for index in range(2):  # the second meets the first in the usable pose set, and its depth is fused with the first's
+        later = replace(tracked, capture_ns=index * FRAME_NS)
+        candidates.remember(later)
+        candidates.process(later)
 
 
 def rehearse_skeletons() -> None:
