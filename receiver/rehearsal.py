@@ -7,6 +7,7 @@ from collections import deque
 import numpy as np
 
 from common.body.mannequin import mannequin, mannequin_camera, mannequin_depth
+from common.body.rigging import Rigging
 from common.body.view import View
 from common.runtime.clock import MonotonicClock
 from common.runtime.stage_timer import StageTimer
@@ -24,13 +25,14 @@ def rehearse() -> None:
     camera = mannequin_camera()
     depth = mannequin_depth(camera)
     view = View(camera, 0, 0, depth, np.full((*depth.shape, 3), 128, np.uint8))
-    message = encode_candidate_pose(CandidatePose(1, 0, 0, 0, skeleton, pose, (view,)))
+    rigging = Rigging("region-growing", "zippered")  # whatever a sender chooses
+    message = encode_candidate_pose(CandidatePose(1, 0, 0, 0, skeleton, pose, (view, view), rigging))
     packet = decode_skeleton(encode_skeleton(SkeletonPacket(0, 0, 0, 0, 0, 1.0, pose)))
     clock = MonotonicClock()
     path = AnimationPath(RepositorySettings(), StageTimer(clock), clock)
     viewer = OffscreenViewer()
     for _ in range(2):  # the second pose meets the first in the repository
-        shown = path.show(SkeletonToShow(packet, skeleton, deque([mesh_of(message, 0)])))
+        shown = path.show(SkeletonToShow(packet, skeleton, deque([mesh_of(message, 0, "all-edges")])))
         for mesh in shown.added:
             viewer.add_pose(mesh)
             encode_pose(mesh)

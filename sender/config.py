@@ -8,7 +8,7 @@ from typing import Literal
 
 from common.body.body_regions import DEFAULT_WEIGHTS, region_weights
 from common.body.joint_edges import ScoreForm
-from common.body.rigging import Segmentation
+from common.body.rigging import Segmentation, Views
 from common.runtime.metrics import MetricsSettings
 from common.transport.zenoh_session import LinkSettings
 
@@ -70,8 +70,8 @@ class CandidateSettings:
     between two that are considered. ``least_confidence``: of a fit, for its frame to become one. ``jpeg_quality``,
     ``depth_step_mm``: how finely a view is sent; the ``thin_`` ones where a pose would take long. ``send_log``: a
     file that gets a JSON line for every send. ``fused_frames``: so many frames are averaged into a pose's depth.
-    ``segmentation``: what belongs to which link. ``region_weights``: ω where it is not the default; ``score_form``:
-    what σ divides by."""
+    ``segmentation``: what belongs to which link. ``views``: one surface of all cameras, or one for each.
+    ``region_weights``: ω where it is not the default; ``score_form``: what σ divides by."""
 
     enabled: bool = True
     choice: Literal["coverage", "paper"] = "coverage"
@@ -83,6 +83,7 @@ class CandidateSettings:
     thin_depth_step_mm: int = 8
     fused_frames: int = 4
     segmentation: Segmentation = "voronoi"
+    views: Views = "separate"
     region_weights: dict[str, float] = field(default_factory=lambda: dict(DEFAULT_WEIGHTS))
     score_form: ScoreForm = "joining-edges"
     send_log: Path | None = None

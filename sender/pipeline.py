@@ -277,7 +277,7 @@ class CandidatePath:
             skeleton=tracked.skeleton,
             pose=tracked.fit.pose,  # not the quantised one: rounding twice could end elsewhere than the packet's
             views=views,
-            rigging=Rigging(self._settings.segmentation),
+            rigging=Rigging(self._settings.segmentation, self._settings.views),
         )
 
 

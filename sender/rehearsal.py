@@ -112,9 +112,10 @@ def rehearse_candidates() -> None:
     skeleton, pose = mannequin()
     fit = FitResult(skeleton, pose, converged=True, iterations=1, inliers=1.0, rms_m=0.0, confidence=1.0)
     T_world_link = forward_kinematics(skeleton, pose)
-    views = (_view(mannequin_camera()),)
+    views = (_view(mannequin_camera()),) * 2
     tracked = TrackedFrame(0, views, fit, skeleton=skeleton, pose=pose, T_world_link=T_world_link)
-    candidates = CandidatePath(_IDENTITY, CandidateSettings(), StageTimer(MonotonicClock()))
+    settings = CandidateSettings(segmentation="region-growing", views="zippered", score_form="all-edges")
+    candidates = CandidatePath(_IDENTITY, settings, StageTimer(MonotonicClock()))
     for index in range(2):  # the second meets the first in the usable pose set, and its depth is fused with the first's
         later = replace(tracked, capture_ns=index * FRAME_NS)
         candidates.remember(later)

@@ -58,7 +58,9 @@ def capsule_person(pose_id: int = 0, pose: SkeletonPose | None = None) -> Rigged
     )
     vertex_link = np.repeat(np.arange(LINK_COUNT, dtype=np.uint8), per_link)
     T_link_world = inverse(T_world_link.astype(np.float64))
-    edges = joint_edges(mesh, vertex_regions(mesh.vertices, vertex_link, SKELETON, T_link_world), T_link_world)
+    edges = joint_edges(
+        mesh.vertices, mesh.faces, vertex_regions(mesh.vertices, vertex_link, SKELETON, T_link_world), T_link_world
+    )
     blend = vertex_blend(mesh.vertices, vertex_link, SKELETON, T_world_link)
     return RiggedMesh(pose_id, 0, SKELETON, pose, T_link_world, mesh, vertex_link, blend, mesh.faces, edges)
 

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from common.body.rigging import Rigging, Segmentation
+from common.body.rigging import Rigging, Segmentation, Views
 from common.body.skeleton import LINK_COUNT, human_skeleton
 from common.body.skeleton_pose import SkeletonPose, rest_pose
 from common.body.view import View
@@ -85,8 +85,9 @@ def test_its_skeleton_and_pose_are_those_of_body_message_and_skeleton_packet() -
 
 
 @pytest.mark.parametrize("segmentation", ["voronoi", "region-growing"])
-def test_how_it_is_rigged_comes_with_it(segmentation: Segmentation) -> None:
-    sent = replace(CANDIDATE, rigging=Rigging(segmentation))
+@pytest.mark.parametrize("views", ["separate", "zippered"])
+def test_how_it_is_rigged_comes_with_it(segmentation: Segmentation, views: Views) -> None:
+    sent = replace(CANDIDATE, rigging=Rigging(segmentation, views))
     assert decode_candidate_pose(encode_candidate_pose(sent)).rigging == sent.rigging
 
 
@@ -162,7 +163,7 @@ def test_bytes_after_the_last_view_are_refused() -> None:
     [
         (0, b"\x31", "version byte 0x31"),
         (10, struct.pack("<q", -5), "capture time"),
-        *((RIGGING_AT, bytes([1 << bit]), "rigging") for bit in range(1, 8)),
+        *((RIGGING_AT, bytes([1 << bit]), "rigging") for bit in range(2, 8)),
         (SKELETON_AT + 12, b"\0\0", "radius"),
         (POSE_AT, b"\xff" * 155, "rotation|padding"),
         (FIXED_BYTES + 4, b"\x41", "version byte 0x41"),

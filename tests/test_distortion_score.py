@@ -82,7 +82,9 @@ def test_a_region_nobody_saw_has_no_score() -> None:
     seen = regions_of(mesh)
     kept = ~(seen[mesh.mesh.faces] == REGION_INDEX["head"]).any(axis=1)
     beheaded = dataclasses.replace(mesh.mesh, faces=mesh.mesh.faces[kept])
-    scrap = dataclasses.replace(mesh, joint_edges=joint_edges(beheaded, seen, mesh.T_link_world))
+    scrap = dataclasses.replace(
+        mesh, joint_edges=joint_edges(beheaded.vertices, beheaded.faces, seen, mesh.T_link_world)
+    )
     scores = region_scores(scrap, links_of(arms_down_by(0.2)))
     assert np.isnan(scores[REGION_INDEX["head"]])
     assert np.isfinite(scores[REGION_INDEX["left_forearm"]])
@@ -130,7 +132,9 @@ def test_a_mesh_without_joint_edges_cannot_be_judged() -> None:
     mesh = captured(0.8)
     one_link = np.zeros_like(mesh.vertex_link)  # region 0 is link 0
     scrap = dataclasses.replace(
-        mesh, vertex_link=one_link, joint_edges=joint_edges(mesh.mesh, one_link, mesh.T_link_world)
+        mesh,
+        vertex_link=one_link,
+        joint_edges=joint_edges(mesh.mesh.vertices, mesh.mesh.faces, one_link, mesh.T_link_world),
     )
     assert distortion_score(scrap, links_of(arms_down_by(0.8)), WEIGHTS) == float("inf")
 

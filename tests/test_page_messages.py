@@ -12,16 +12,21 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from common.body.rigged_mesh import RiggedMesh
+from common.body.rigged_mesh import RiggedMesh, build_rigged_mesh
+from common.body.rigging import Rigging
 from common.body.skeleton import LINK_COUNT, LINK_PARENTS
 from common.body.skinning import captured_joints
 from common.body.vertex_blend import VertexBlend
 from common.geometry.triangle_mesh import TriangleMesh
 from receiver.viewer import page_messages
 from receiver.viewer.viewer import ConnectionState, ViewerStatus
-from tests.capsule_person import capsule_person, shown_frame
+from tests.capsule_person import SKELETON, capsule_person, shown_frame
+from tests.capsule_views import arms_down_by, capsule_views
 
 PERSON = capsule_person(pose_id=7)
+ZIPPERED = build_rigged_mesh(
+    7, 0, SKELETON, arms_down_by(0.8), capsule_views(arms_down_by(0.8), 3), Rigging(views="zippered")
+)
 
 
 def trimmed(vertices: int) -> RiggedMesh:
@@ -57,7 +62,7 @@ def padded(length: int) -> int:
 
 
 @pytest.mark.parametrize(
-    "mesh", [PERSON, large(), *(trimmed(n) for n in (3, 4, 5, 6))], ids=lambda m: str(len(m.vertex_link))
+    "mesh", [PERSON, ZIPPERED, large(), *(trimmed(n) for n in (3, 4, 5, 6))], ids=lambda m: str(len(m.vertex_link))
 )
 def test_pose_message_holds_the_mesh(mesh: RiggedMesh) -> None:
     message = page_messages.encode_pose(mesh)

@@ -98,7 +98,10 @@ def test_an_edge_counts_in_both_its_regions() -> None:
 
 
 def test_what_eq_1_divides_by_can_be_all_edges_or_a_fixed_length() -> None:
-    every, fixed = (joint_edges(MESH.mesh, REGIONS, MESH.T_link_world, form) for form in ("all-edges", "fixed-length"))
+    every, fixed = (
+        joint_edges(MESH.mesh.vertices, MESH.mesh.faces, REGIONS, MESH.T_link_world, form)
+        for form in ("all-edges", "fixed-length")
+    )
     ends = np.array(sorted(all_edges()))
     lengths = np.linalg.norm(MESH.mesh.vertices[ends[:, 0]] - MESH.mesh.vertices[ends[:, 1]], axis=1)
     for region in (REGION_INDEX["head"], REGION_INDEX["left_shin"]):

@@ -10,7 +10,6 @@ from numba import njit
 from numpy.typing import NDArray
 
 from common.body.body_regions import REGION_COUNT, REGION_LINKS
-from common.geometry.triangle_mesh import TriangleMesh
 
 # What Eq. (1) divides the change of a region's edges by: their own length, as printed; that of all the region's edges,
 # those within it too; or their number times a fixed length. The first grows as edges get shorter, and the paper's
@@ -45,41 +44,44 @@ class JointEdges:
 
 
 def joint_edges(
-    mesh: TriangleMesh,
+    vertices: NDArray[np.float32],
+    faces: NDArray[np.int32],
     vertex_region: NDArray[np.uint8],
     T_link_world: NDArray[np.float64],
     score_form: ScoreForm = "joining-edges",
 ) -> JointEdges:
     """Collect the edges between links, each once, sorted by region pair.
 
+    ``vertices`` (V, 3) [m, world], ``faces`` (F, 3), in which a place has one number also along seams;
     ``vertex_region`` (V,) uint8 (``vertex_regions``), ``T_link_world`` (L, 4, 4): as in ``RiggedMesh``.
     """
-    count = len(mesh.vertices)
-    keys = np.unique(_joining_edge_keys(mesh.faces, vertex_region, REGION_LINKS))
+    count = len(vertices)
+    keys = np.unique(_joining_edge_keys(faces, vertex_region, REGION_LINKS))
     pair, ends = np.divmod(keys, count * count)
-    vertices = np.stack(np.divmod(ends, count), axis=1).astype(np.int32)
+    ends = np.stack(np.divmod(ends, count), axis=1).astype(np.int32)
     starts = np.flatnonzero(np.diff(pair, prepend=-1))
     regions = np.stack(np.divmod(pair, REGION_COUNT), axis=1).astype(np.uint8)
     links = REGION_LINKS[regions]
     a, b = (
-        np.einsum("eij,ej->ei", T_link_world[links[:, k], :3, :3], mesh.vertices[vertices[:, k]])
+        np.einsum("eij,ej->ei", T_link_world[links[:, k], :3, :3], vertices[ends[:, k]])
         + T_link_world[links[:, k], :3, 3]
         for k in (0, 1)
     )
-    lengths = np.linalg.norm(mesh.vertices[vertices[:, 0]] - mesh.vertices[vertices[:, 1]], axis=1)
+    lengths = np.linalg.norm(vertices[ends[:, 0]] - vertices[ends[:, 1]], axis=1)
     return JointEdges(
-        vertices=vertices,
+        vertices=ends,
         points=np.ascontiguousarray(np.concatenate([a, b], axis=1).T, np.float32),
         rest_lengths=lengths.astype(np.float32),
         pair_regions=np.ascontiguousarray(regions[starts]),
         pair_links=np.ascontiguousarray(links[starts]),
         pair_starts=np.append(starts, len(keys)).astype(np.int32),
-        region_lengths=_region_lengths(mesh, vertex_region, regions, lengths, score_form),
+        region_lengths=_region_lengths(vertices, faces, vertex_region, regions, lengths, score_form),
     )
 
 
 def _region_lengths(
-    mesh: TriangleMesh,
+    vertices: NDArray[np.float32],
+    faces: NDArray[np.int32],
     vertex_region: NDArray[np.uint8],
     edge_regions: NDArray[np.uint8],
     lengths: NDArray[np.floating],
@@ -91,7 +93,7 @@ def _region_lengths(
     total = sum(np.bincount(edge_regions[:, k], weights=lengths, minlength=REGION_COUNT) for k in (0, 1))
     if score_form == "all-edges":
         joined = np.asarray(total) > 0
-        total = np.where(joined, _all_edge_lengths(mesh.vertices, mesh.faces, vertex_region, REGION_COUNT), 0)
+        total = np.where(joined, _all_edge_lengths(vertices, faces, vertex_region, REGION_COUNT), 0)
     return np.asarray(total, np.float32)
 
 

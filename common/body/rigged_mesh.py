@@ -22,6 +22,7 @@ from common.body.skeleton import LINK_COUNT, LINK_PARENTS, Skeleton
 from common.body.skeleton_pose import SkeletonPose, forward_kinematics
 from common.body.vertex_blend import VertexBlend, vertex_blend
 from common.body.view import View
+from common.body.zipper import zippered
 from common.geometry.rigid_transform import inverse
 from common.geometry.triangle_mesh import TriangleMesh
 
@@ -52,7 +53,8 @@ class RiggedMesh:
     ``T_link_world`` (L, 4, 4) float64: world at capture → link frames. ``vertex_link`` (V,) uint8: its segment, which
     σ goes by; ``blend``: its neighbour's part, for skinning.
     ``mesh.faces`` holds every triangle; ``faces_drawn`` (F', 3) int32 are its first F', whose edges were at most 6 cm
-    at capture and join links at most two steps apart. The views stay separate surfaces in the one mesh.
+    at capture and join links at most two steps apart. Views are one surface in it (zippered), but for what they paint:
+    along a seam, places have a vertex for each view. Or they stay separate surfaces.
     """
 
     pose_id: int
@@ -103,27 +105,31 @@ def build_rigged_mesh(
     if not views:
         raise ValueError(f"pose {pose_id}: no views")
     meshes = [mesh_view(view, MESH_STRIDE) for view in views]
-    mesh = _merged(meshes)
+    mesh = merged(meshes)
     if len(mesh.faces) == 0:
         raise ValueError(f"pose {pose_id}: its {len(views)} views hold no surface")
     T_world_link = forward_kinematics(skeleton, pose)
     T_link_world = inverse(T_world_link.astype(np.float64)).astype(np.float64)
+    source = weld = np.arange(len(mesh.vertices), dtype=np.int32)
+    if rigging.views == "zippered" and len(views) > 1:
+        one = zippered(mesh, meshes, views, MESH_STRIDE)
+        mesh, source, weld = one.mesh, one.source, one.weld
     if rigging.segmentation == "region-growing":
         grown = [grown_regions(v, m, MESH_STRIDE, skeleton, T_world_link) for v, m in zip(views, meshes, strict=True)]
-        vertex_link = np.concatenate(grown)
+        vertex_link = np.concatenate(grown)[source][weld]
     else:
         vertex_link = nearest_link(mesh.vertices, skeleton, T_world_link)
     mesh, drawn_count = _drawn_first(mesh, vertex_link)
     if drawn_count == 0:
         raise ValueError(f"pose {pose_id}: nothing of its {len(mesh.faces)} triangles can be drawn")
     vertex_region = vertex_regions(mesh.vertices, vertex_link, skeleton, T_link_world)
-    edges = joint_edges(mesh, vertex_region, T_link_world, score_form)
+    edges = joint_edges(mesh.vertices, weld[mesh.faces], vertex_region, T_link_world, score_form)
     blend = vertex_blend(mesh.vertices, vertex_link, skeleton, T_world_link)
     drawn = mesh.faces[:drawn_count]
     return RiggedMesh(pose_id, capture_ns, skeleton, pose, T_link_world, mesh, vertex_link, blend, drawn, edges)
 
 
-def _merged(meshes: Sequence[TriangleMesh]) -> TriangleMesh:
+def merged(meshes: Sequence[TriangleMesh]) -> TriangleMesh:
     """One mesh of one or more, their surfaces unconnected, their textures side by side in one atlas."""
     first = np.cumsum([0, *(len(m.vertices) for m in meshes[:-1])], dtype=np.int32)
     lefts = np.cumsum([0, *(m.texture.shape[1] for m in meshes[:-1])])

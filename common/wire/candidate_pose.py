@@ -4,7 +4,7 @@ Both ends build the mesh from the *decoded* candidate, so the sender too decodes
 ``decode_candidate_pose(encode_candidate_pose(c))`` is the one candidate there is.
 Layout, little endian: header | skeleton sizes | pose | per view: length u32, view.
 header: version u8, person u8, epoch u32, pose id u32, capture time i64 [ns], rigging u8, number of views u8.
-rigging: bit 0 region growing instead of Voronoi cells; the other bits are 0.
+rigging: bit 0 region growing instead of Voronoi cells, bit 1 views zippered; the other bits are 0.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from __future__ import annotations
 import struct
 from dataclasses import dataclass
 
-from common.body.rigging import DEFAULT_RIGGING, Rigging
+from common.body.rigging import DEFAULT_RIGGING, Rigging, Segmentation
 from common.body.skeleton import Skeleton
 from common.body.skeleton_pose import SkeletonPose
 from common.body.view import View
@@ -27,7 +27,7 @@ MAX_PIXELS = 2 * VIEW_MAX_PIXELS  # of all views together: bounds what a candida
 
 _HEADER = struct.Struct("<BBIIqBB")
 _LENGTH = struct.Struct("<I")
-_REGION_GROWING = 1
+_REGION_GROWING, _ZIPPERED = 1, 2
 _FIXED_BYTES = _HEADER.size + SKELETON_BYTES + POSE_BYTES
 
 
@@ -62,7 +62,7 @@ def encode_candidate_pose(candidate: CandidatePose, jpeg_quality: int = JPEG_QUA
             checked_int("epoch", candidate.epoch, 0, U32_MAX),
             checked_int("pose id", candidate.pose_id, 0, U32_MAX),
             checked_int("capture time", candidate.capture_ns, 0, TIME_MAX_NS),
-            _REGION_GROWING if candidate.rigging.segmentation == "region-growing" else 0,
+            _encode_rigging(candidate.rigging),
             checked_int("number of views", len(candidate.views), 1, MAX_VIEWS),
         ),
         encode_skeleton_sizes(candidate.skeleton),
@@ -96,10 +96,16 @@ def decode_candidate_pose(data: bytes) -> CandidatePose:
     return CandidatePose(pose_id, person, epoch, capture_ns, skeleton, pose, views, rigging)
 
 
+def _encode_rigging(rigging: Rigging) -> int:
+    grown, zippered = rigging.segmentation == "region-growing", rigging.views == "zippered"
+    return (_REGION_GROWING if grown else 0) | (_ZIPPERED if zippered else 0)
+
+
 def _decode_rigging(flags: int) -> Rigging:
-    if flags & ~_REGION_GROWING:  # a mesh built otherwise than the sender's would be judged wrongly
+    if flags & ~(_REGION_GROWING | _ZIPPERED):  # a mesh built otherwise than the sender's would be judged wrongly
         raise WireError(f"candidate pose: rigging 0x{flags:02x} asks for what is not known here")
-    return Rigging("region-growing" if flags & _REGION_GROWING else "voronoi")
+    segmentation: Segmentation = "region-growing" if flags & _REGION_GROWING else "voronoi"
+    return Rigging(segmentation, "zippered" if flags & _ZIPPERED else "separate")
 
 
 def _decode_views(data: bytes, count: int) -> tuple[View, ...]:
