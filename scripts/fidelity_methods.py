@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from common.body.rigged_mesh import RiggedMesh
+from common.body.rigging import Rigging
 from common.body.skeleton import LINK_COUNT, LINK_INDEX, SIDES, Skeleton
 from common.body.skeleton_pose import SkeletonPose, forward_kinematics
 from common.body.skinning import animate, link_motion
@@ -37,6 +38,7 @@ CANDIDATE_EVERY = 6  # frames: 200 ms, as in the sender
 LEAST_CONFIDENCE = 0.5
 WRONG_SHARE, WRONG_BY_RAD = 0.2, 0.35  # of the candidates; at the shoulder: 12 to 20 cm at a stretched arm's wrist
 DEPTH_STEP_MM, JPEG_QUALITY = 2, 85
+RIGGING = Rigging(CandidateSettings().segmentation, CandidateSettings().views)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -75,7 +77,7 @@ def encoded_candidate(
         return None
     posed_views = PosedViews(k * FRAME_NS, captured.views, forward_kinematics(fitted[0], fitted[1]))
     views = captured.views if fusion is None else fusion.fused(posed_views, fitted[0])
-    candidate = CandidatePose(pose_id, 0, 1, k * FRAME_NS, fitted[0], fitted[1], views)
+    candidate = CandidatePose(pose_id, 0, 1, k * FRAME_NS, fitted[0], fitted[1], views, RIGGING)
     return encode_candidate_pose(candidate, JPEG_QUALITY, DEPTH_STEP_MM)
 
 

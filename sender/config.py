@@ -83,7 +83,7 @@ class CandidateSettings:
     thin_depth_step_mm: int = 8
     fused_frames: int = 4
     segmentation: Segmentation = "voronoi"
-    views: Views = "separate"
+    views: Views = "zippered"
     region_weights: dict[str, float] = field(default_factory=lambda: dict(DEFAULT_WEIGHTS))
     score_form: ScoreForm = "joining-edges"
     send_log: Path | None = None

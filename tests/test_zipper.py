@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -158,6 +159,22 @@ def test_any_number_of_views_becomes_a_rigged_mesh(cameras: int) -> None:
     assert np.isfinite(mesh.mesh.vertices).all()
     assert mesh.mesh.uv.min() >= 0
     assert mesh.mesh.uv.max() <= 1
+
+
+def test_an_outline_says_how_far_out_a_surface_is_that_another_view_sees_straight_on() -> None:
+    """Depths of one camera are 6 mm short; they move out where a camera at right angles has its outline."""
+    views = [ball_view(eye, 100) for eye in RING]
+    short = np.where(views[0].depth_mm > 0, views[0].depth_mm + 6, 0).astype(np.uint16)
+    views[0] = replace(views[0], depth_mm=short)
+    meshes = [mesh_view(view, MESH_STRIDE) for view in views]
+    one = zippered(merged(meshes), meshes, views, MESH_STRIDE)
+    x, y, z = one.mesh.vertices.T
+    at_the_outline = (x > 0) & (np.abs(y) < 0.05) & (np.abs(z - 0.125) < 0.02)  # of the camera at z = 2 m
+    off = np.linalg.norm(one.mesh.vertices[at_the_outline], axis=1) - RADIUS_M
+    assert len(off) > 20
+    assert (off > -0.004).mean() > 0.1  # moved out: those of the outermost square
+    elsewhere = (x > 0) & (np.abs(y) < 0.05) & (np.abs(z) < 0.02)
+    assert (np.linalg.norm(one.mesh.vertices[elsewhere], axis=1) - RADIUS_M).max() < -0.005
 
 
 def test_drawn_triangles_are_surface_only() -> None:
