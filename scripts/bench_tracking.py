@@ -23,6 +23,7 @@ from scripts.tracking_conditions import condition, performer_for, sights
 from scripts.tracking_figures import save_all
 from scripts.tracking_run import Case, Result, flips_of, follow, is_clean
 from sender.fitting.articp_tracker import ARTICP_ABLATIONS
+from sender.fitting.gauss_newton_tracker import GAUSS_NEWTON_ABLATIONS
 from sender.fitting.open_tracker import TRACKERS, open_tracker
 from sender.fitting.tracker import Tracker
 
@@ -30,7 +31,8 @@ DEFAULT_CONDITIONS = (
     "points-given,points-auto,depth4-auto,depth2-auto,depth1-auto,"
     "15fps-given,noise1cm-given,noise3cm-given,share5-given,share2-given"
 )
-CONTESTANTS = (*TRACKERS, *ARTICP_ABLATIONS)
+ABLATIONS = {**ARTICP_ABLATIONS, **GAUSS_NEWTON_ABLATIONS}
+CONTESTANTS = (*TRACKERS, *ABLATIONS)
 ROUTINE = "routine"  # the built-in performer's motion
 WARM_UP_S = 0.3
 _UNITS = {"time_to_skeleton_s": "s", "ms_per_frame_p50": "ms", "ms_per_frame_p99": "ms", "lost_share": "1"}
@@ -71,7 +73,7 @@ def run(
 
 def contestant(name: str) -> Tracker:
     """A tracker, or one with parts switched off, by its name in ``CONTESTANTS``."""
-    return ARTICP_ABLATIONS[name](None) if name in ARTICP_ABLATIONS else open_tracker(name)
+    return ABLATIONS[name](None) if name in ABLATIONS else open_tracker(name)
 
 
 def means(results: Iterable[Result], jobs: int = 1) -> Iterator[Row]:

@@ -1,8 +1,10 @@
 """What a tracker under test is given to see: the conditions of ``bench_tracking``, by name.
 
 A condition is SIGHT-START. Sights: ``points`` (2,500 of 10,000 points of the true surface, 30 a second), ``shareN``
-(N % of the 10,000), ``Nfps`` (so many frames a second), ``noiseNcm`` (Gaussian noise of N cm on every point) and
-``depthN`` (N virtual depth cameras with their noise, through the real reconstruction; with one, it is the frontal one).
+(N % of the 10,000), ``Nfps`` (so many frames a second), ``noiseNcm`` (Gaussian noise of σ N cm on each axis of every
+point), ``scatterNcm`` (the noise of Lien 2009 §6.2: every point moved in a random direction by a Gaussian distance of
+σ N cm, √3 times less) and ``depthN`` (N virtual depth cameras with their noise, through the real reconstruction; with
+one, it is the frontal one).
 Starts: ``given`` (the first pose and the sizes are the true ones, as in Lien 2009 §6), ``auto`` (nothing is given; the
 performer holds an A-pose for a second) and ``unposed`` (nothing is given, and the film begins in mid-motion).
 
@@ -29,6 +31,7 @@ from sender.capture.frame_set import DepthFrame
 from sender.capture.performer import open_performer
 from sender.capture.rig_layout import RigSettings
 from sender.capture.rig_process import RigRenderer
+from sender.capture.skinned_body import PerformerMesh
 from sender.reconstruction.background import BackgroundModel, BackgroundSettings
 from sender.reconstruction.foreground_points import PointSampler
 
@@ -40,12 +43,15 @@ POINTS = 2500  # of which a tracker gets so many
 FRAME_RATE_HZ = 30.0
 NEIGHBOURS = 80  # of 20 to 320, what comes nearest to the true normals from 1 to 3 cm of noise: 13 to 28° (median)
 MOTION_BEGINS_S = REST_S + BLEND_S
-_SIGHT = re.compile(r"points|depth(?P<cameras>\d+)|share(?P<share>\d+)|(?P<fps>\d+)fps|noise(?P<noise>\d+)cm")
+_SIGHT = re.compile(
+    r"points|depth(?P<cameras>\d+)|share(?P<share>\d+)|(?P<fps>\d+)fps|(?:noise|scatter)(?P<noise>\d+)cm"
+)
 
 
 @dataclass(frozen=True, slots=True)
 class Condition:
-    """``cameras``: how many depth cameras look, 0 for points of the surface itself, moved by ``noise_m`` (σ)."""
+    """``cameras``: how many depth cameras look, 0 for points of the surface itself, moved by ``noise_m`` (σ): on each
+    axis, or, if ``scattered``, in a random direction."""
 
     name: str
     start: Start
@@ -53,6 +59,7 @@ class Condition:
     points: int = POINTS
     frame_rate_hz: float = FRAME_RATE_HZ
     noise_m: float = 0.0
+    scattered: bool = False
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -75,7 +82,8 @@ def condition(name: str) -> Condition:
     match = _SIGHT.fullmatch(sight)
     if match is None or start not in ("given", "auto", "unposed"):
         raise ValueError(
-            f"condition {name!r}: expected points, depthN, shareN, Nfps or noiseNcm, then -given, -auto or -unposed"
+            f"condition {name!r}: expected points, depthN, shareN, Nfps, noiseNcm or scatterNcm, "
+            "then -given, -auto or -unposed"
         )
     number = {key: int(value) for key, value in match.groupdict().items() if value is not None}
     if not all(1 <= value <= 100 for value in number.values()) or number.get("cameras", 1) > 16:
@@ -87,6 +95,7 @@ def condition(name: str) -> Condition:
         points=SAMPLED * number["share"] // 100 if "share" in number else POINTS,
         frame_rate_hz=float(number.get("fps", FRAME_RATE_HZ)),
         noise_m=number.get("noise", 0) / 100,
+        scattered=sight.startswith("scatter"),
     )
 
 
@@ -105,8 +114,8 @@ def sights(performer: BodyPerformer, seen: Condition, seconds: float | None) -> 
         time_s = begin_s + frame / seen.frame_rate_hz
         surface = performer.surface(time_s)
         if rig is None:
-            cloud = surface_points(surface, performer.mesh.faces, performer.mesh.vertex_colours, SAMPLED, random)
-            cloud = noisy(cloud, seen.points, seen.noise_m, random)
+            cloud = textured_points(surface, performer.mesh, SAMPLED, random)
+            cloud = noisy(cloud, seen.points, seen.noise_m, random, seen.scattered)
         else:
             cloud = rig.cloud(frame, time_s)
         yield Sight(time_s - begin_s, cloud, surface, performer.named_joints(time_s))
@@ -138,6 +147,21 @@ def surface_points(
     vertices: Array, faces: Array, colours: Array, count: int, random: np.random.Generator
 ) -> PointCloud:
     """``count`` points spread evenly over a mesh: ``vertices`` (V, 3) [m], ``faces`` (F, 3), ``colours`` (V, 3)."""
+    points, normals, chosen, _ = _spread(vertices, faces, count, random)
+    return PointCloud(points, normals, colours[faces[chosen, 0]])
+
+
+def textured_points(vertices: Array, mesh: PerformerMesh, count: int, random: np.random.Generator) -> PointCloud:
+    """``surface_points`` of a performer's mesh whose ``vertices`` are at (V, 3) [m], coloured as its texture is."""
+    points, normals, chosen, shares = _spread(vertices, mesh.faces, count, random)
+    return PointCloud(points, normals, _colours(mesh, mesh.faces[chosen], shares))
+
+
+def _spread(
+    vertices: Array, faces: Array, count: int, random: np.random.Generator
+) -> tuple[NDArray[np.float32], NDArray[np.float32], Array, Array]:
+    """Points (N, 3) and normals (N, 3) spread evenly over a mesh, the triangle (N,) of each and its place in it as
+    shares (N, 3) of the corners."""
     a, b, c = (vertices[faces[:, corner]] for corner in range(3))
     normals = np.cross(b - a, c - a)
     areas = np.linalg.norm(normals, axis=1)
@@ -145,18 +169,34 @@ def surface_points(
     s, t = np.sort(random.random((2, count, 1)), axis=0)
     points = a[chosen] * s + b[chosen] * (t - s) + c[chosen] * (1 - t)
     unit = normals[chosen] / np.maximum(areas[chosen, None], 1e-12)
-    return PointCloud(points.astype(np.float32), unit.astype(np.float32), colours[faces[chosen, 0]])
+    return points.astype(np.float32), unit.astype(np.float32), chosen, np.concatenate([s, t - s, 1 - t], axis=1)
 
 
-def noisy(cloud: PointCloud, count: int, noise_m: float, random: np.random.Generator) -> PointCloud:
-    """The first ``count`` points of ``cloud``, every point moved by Gaussian noise (σ ``noise_m`` on each axis).
+def _colours(mesh: PerformerMesh, corners: Array, shares: Array) -> NDArray[np.uint8]:
+    """Colours (N, 3) uint8 of points on a mesh: ``corners`` (N, 3) of their triangles, ``shares`` (N, 3) of each."""
+    if mesh.uv is None or mesh.texture is None:
+        return mesh.vertex_colours[corners[:, 0]]
+    u, v = np.einsum("nk,nka->an", shares, mesh.uv[corners])
+    height, width = mesh.texture.shape[:2]
+    rows, columns = (v * height).astype(np.int64), (u * width).astype(np.int64)
+    return mesh.texture[np.clip(rows, 0, height - 1), np.clip(columns, 0, width - 1)]
+
+
+def noisy(
+    cloud: PointCloud, count: int, noise_m: float, random: np.random.Generator, scattered: bool = False
+) -> PointCloud:
+    """The first ``count`` points of ``cloud``, every point moved by Gaussian noise: σ ``noise_m`` on each axis, or, if
+    ``scattered``, in a random direction by a distance of that σ.
 
     With noise, normals are those of the noisy surface: of the plane through each point's neighbours in all of it.
     """
     normals = cloud.normals[:count]
     if noise_m == 0:
         return PointCloud(cloud.positions[:count], normals, cloud.colours[:count])
-    moved = cloud.positions + noise_m * random.standard_normal(cloud.positions.shape)
+    off = random.standard_normal(cloud.positions.shape)
+    if scattered:
+        off *= random.standard_normal((len(off), 1)) / np.linalg.norm(off, axis=1, keepdims=True)
+    moved = cloud.positions + noise_m * off
     near = moved[cKDTree(moved).query(moved[:count], NEIGHBOURS)[1]]
     near -= near.mean(axis=1, keepdims=True)
     flattest = np.linalg.eigh(np.einsum("nka,nkb->nab", near, near))[1][:, :, 0]

@@ -22,8 +22,10 @@ from scripts.tracking_conditions import (
     performer_for,
     sights,
     surface_points,
+    textured_points,
 )
 from scripts.tracking_run import FLIP_RATE_HZ, Case, Result, Run, flips, is_clean
+from sender.capture.skinned_body import PerformerMesh
 from sender.fitting.tracker import FitResult
 from tests.capsule_person import SKELETON, pose_at
 
@@ -122,6 +124,7 @@ def test_a_clip_with_a_few_flips_is_clean() -> None:
         ("share2-given", (0, 200, 30.0, 0.0)),
         ("15fps-unposed", (0, 2500, 15.0, 0.0)),
         ("noise3cm-auto", (0, 2500, 30.0, 0.03)),
+        ("scatter3cm-auto", (0, 2500, 30.0, 0.03)),
     ],
 )
 def test_conditions_by_name(name: str, expected: tuple[int, int, float, float]) -> None:
@@ -150,6 +153,27 @@ def test_noise_moves_points_as_said_and_their_normals_come_from_the_noisy_surfac
         cosines = (cloud.normals * plane.normals[:2500]).sum(axis=1)
         assert cosines.min() >= 0
         assert tilt_deg[0] < np.degrees(np.median(np.arccos(np.clip(cosines, -1, 1)))) < tilt_deg[1]
+
+
+def test_scattered_points_move_by_a_distance_of_the_sigma_in_every_direction() -> None:
+    random = np.random.default_rng(0)
+    still = PointCloud(
+        np.zeros((4000, 3), np.float32), np.tile(np.float32([0, 1, 0]), (4000, 1)), np.zeros((4000, 3), np.uint8)
+    )
+    moved = noisy(still, 4000, 0.03, random, scattered=True).positions
+    assert np.sqrt((moved**2).sum(axis=1).mean()) == pytest.approx(0.03, rel=0.05)
+    assert moved.std(axis=0) == pytest.approx(np.full(3, 0.03 / np.sqrt(3)), rel=0.08)
+
+
+def test_points_have_the_colours_of_the_texture() -> None:
+    corners = np.array([[0, 0, 0], [1, 0, 0], [0, 0, 1]], np.float32)
+    texture = np.zeros((10, 10, 3), np.uint8)
+    texture[:, 5:] = 200
+    mesh = PerformerMesh(
+        np.array([[0, 2, 1]], np.int32), np.zeros((3, 3), np.uint8), corners[:, [0, 2]], texture
+    )  # fmt: skip
+    cloud = textured_points(corners, mesh, 500, np.random.default_rng(0))
+    np.testing.assert_array_equal(cloud.colours[:, 0] == 200, cloud.positions[:, 0] >= 0.5)
 
 
 def test_the_built_in_film_has_the_condition_it_is_asked_for() -> None:
@@ -209,6 +233,6 @@ def test_a_bench_cut_off_keeps_the_cases_it_has_done(tmp_path: Path) -> None:
 
 
 def test_every_contestant_opens_and_has_seen_nothing() -> None:
-    assert {"gauss-newton", "articp", "articp-no-global"} <= set(CONTESTANTS)
+    assert {"gauss-newton", "gauss-newton-colours", "articp", "articp-no-global"} <= set(CONTESTANTS)
     for name in CONTESTANTS:
         assert contestant(name).track(NOTHING, 0) is None

@@ -13,7 +13,7 @@ from common.body.skeleton_pose import bone_segments, forward_kinematics, rest_po
 from common.geometry.point_cloud import PointCloud
 from sender.fitting import body_model
 from sender.fitting.body_model import BodyModel, nearest_bones
-from sender.fitting.closest_point_grid import MAX_CELLS, build_link_grid, match_points
+from sender.fitting.closest_point_grid import MAX_CELLS, build_link_grid, match_points, tints
 
 SKELETON = human_skeleton(1.7)
 T_REST = forward_kinematics(SKELETON, rest_pose(np.array([0.0, 0.9, 0.0])))
@@ -170,8 +170,31 @@ def test_grids_follow_a_few_links_at_a_time() -> None:
     near = np.full((10, 2), LINK_INDEX["left_forearm"], np.int8)
     cloud = forearm_cloud(7)
     R, t = T_REST[:, :3, :3].astype(np.float64), T_REST[:, :3, 3].astype(np.float64)
-    match_points(cloud.positions[:10], cloud.normals[:10], near, R, t, now, links, rows, d2)
+    match_points(cloud.positions[:10], cloud.normals[:10], tints(cloud.colours[:10]), near, R, t, now, links, rows, d2)
     assert (np.sqrt(d2) < 0.025).all()
+
+
+def owner_of(body: BodyModel, point: PointCloud) -> int:
+    """Link whose surface ``point`` is matched with."""
+    links, rows, d2 = np.empty(1, np.int64), np.empty(1, np.int64), np.empty(1)
+    near = np.array([[LINK_INDEX["left_forearm"], LINK_INDEX["right_forearm"]]], np.int8)
+    R, t = T_REST[:, :3, :3].astype(np.float64), T_REST[:, :3, 3].astype(np.float64)
+    surface = body.surface()
+    match_points(point.positions, point.normals, tints(point.colours), near, R, t, surface, links, rows, d2)
+    return int(links[0])
+
+
+@pytest.mark.parametrize("exposure", [0.6, 1.0])
+def test_a_point_between_two_links_goes_to_the_one_of_its_colour_however_bright(exposure: float) -> None:
+    up, skin, cloth = np.float32([[0, 0, 1]]), (210, 150, 120), (40, 60, 160)
+    point = np.float32([[0, 0.9, 0]])
+    for match_colours, expected in ((True, "right_forearm"), (False, "left_forearm")):
+        body = BodyModel(SKELETON, match_colours)
+        for side, colour, away in (("left", skin, 0.012), ("right", cloth, 0.018)):
+            one = PointCloud(point + np.float32([0, away, 0]), up, np.array([colour], np.uint8))
+            body.add_assigned(one, T_REST, np.array([LINK_INDEX[f"{side}_forearm"]]), np.ones(1))
+        seen = PointCloud(point, up, (np.array([cloth]) * exposure).astype(np.uint8))
+        assert owner_of(body, seen) == LINK_INDEX[expected]
 
 
 def test_saved_and_loaded_body_has_the_same_surface() -> None:

@@ -258,6 +258,7 @@ def apply_step(x: Array, root: Array, local: Array, table: JointTable) -> None:
 def fit_pose(
     points: Array,
     normals: Array,
+    tinted: Array,
     start: PoseState,
     predicted: PoseState,
     offsets: Array,
@@ -267,8 +268,9 @@ def fit_pose(
 ) -> PoseState:
     """The pose fitted to a cloud; ``judge_pose`` says how well.
 
-    ``points, normals`` (N, 3) float32 [m, world]; ``start``: where iterations begin; ``predicted``: where the motion
-    prior pulls; ``offsets`` (L, 3) float64 [m]: joints in their parents' frames. An empty cloud returns the start.
+    ``points, normals`` (N, 3), ``tinted`` (N, 2) float32 [m, world]: the last from ``tints``; ``start``: where
+    iterations begin; ``predicted``: where the motion prior pulls; ``offsets`` (L, 3) float64 [m]: joints in
+    their parents' frames. An empty cloud returns the start.
     """
     root, local = start.root.copy(), start.local.copy()
     links, size = len(local), 6 + len(table.dof_link)
@@ -283,7 +285,7 @@ def fit_pose(
         R, t = forward(root, local, offsets, table.parents)
         if iteration % 3 == 0:
             near_links(points, R, t, surface, gate + 0.02, near)
-        match_points(points, normals, near, R, t, surface, link, row, d2)
+        match_points(points, normals, tinted, near, R, t, surface, link, row, d2)
         normal_equations(points, link, row, d2, R, t, surface, gate, plan.point_share, H, g)
         project_on_axes(H, g, R, t, table, scale, A, b)
         add_priors(root, local, predicted.root, predicted.local, table, plan.step_scale, plan.damping, A, b)
@@ -295,7 +297,7 @@ def fit_pose(
 
 @njit(nogil=True, cache=True, error_model="numpy")
 def judge_pose(
-    points: Array, normals: Array, state: PoseState, offsets: Array, surface: Surface, parents: Array
+    points: Array, normals: Array, tinted: Array, state: PoseState, offsets: Array, surface: Surface, parents: Array
 ) -> FitArrays:
     """How well a pose explains a cloud, without moving it (arguments as in ``fit_pose``)."""
     R, t = forward(state.root, state.local, offsets, parents)
@@ -303,7 +305,7 @@ def judge_pose(
     near = np.empty((count, NEAR_LINKS), np.int8)
     near_links(points, R, t, surface, JUDGED_M, near)
     link, row, d2 = np.empty(count, np.int64), np.empty(count, np.int64), np.empty(count)
-    match_points(points, normals, near, R, t, surface, link, row, d2)
+    match_points(points, normals, tinted, near, R, t, surface, link, row, d2)
     assigned, explained = np.zeros(len(R)), np.zeros(len(R))
     score, inliers, square = 0.0, 0, 0.0
     for n in range(count):

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from common.geometry.point_cloud import PointCloud
 from sender.fitting.articulated_gauss_newton import FitArrays, PoseState, Schedule, fit_pose, judge_pose
 from sender.fitting.body_model import BodyModel
+from sender.fitting.closest_point_grid import tints
 from sender.fitting.joint_limits import JointTable
 
 Array = NDArray[Any]
@@ -28,11 +29,17 @@ class BodyFitter:
 
     def move(self, cloud: PointCloud, start: PoseState, predicted: PoseState, plan: Schedule) -> PoseState:
         """``fit_pose`` of this body."""
-        return fit_pose(cloud.positions, cloud.normals, start, predicted, self.offsets, self.surface, self.table, plan)
+        return fit_pose(
+            cloud.positions, cloud.normals, tints(cloud.colours), start, predicted, self.offsets, self.surface,
+            self.table, plan,
+        )  # fmt: skip
 
     def judge(self, cloud: PointCloud, state: PoseState) -> FitArrays:
         """``judge_pose`` of this body."""
-        return judge_pose(cloud.positions, cloud.normals, state, self.offsets, self.surface, self.table.parents)
+        return judge_pose(
+            cloud.positions, cloud.normals, tints(cloud.colours), state, self.offsets, self.surface,
+            self.table.parents,
+        )  # fmt: skip
 
     def fit(self, cloud: PointCloud, start: PoseState, predicted: PoseState, plan: Schedule) -> FitArrays:
         """Moved, then judged on the same points."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import io
 import zipfile
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import njit
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from common.body.skeleton import LINK_COUNT, LINK_INDEX, LINK_PARENTS, Skeleton
 from common.body.skeleton_pose import bone_segments
 from common.geometry.point_cloud import PointCloud
-from sender.fitting.closest_point_grid import LinkGrid, Surface, build_link_grid, shifted
+from sender.fitting.closest_point_grid import LinkGrid, Surface, build_link_grid, shifted, tints
 
 Array = NDArray[Any]
 
@@ -42,13 +42,15 @@ _UNSPLIT = {"fingers": "hand", "toes": "foot"}  # locked joints: their points be
 class BodyModel:
     """Surface points per link, gathered from clouds with known poses.
 
-    ``skeleton``: sizes. Adding points does not move the surface at once: ``surface`` brings links up to date.
+    ``skeleton``: sizes. ``match_colours``: whether points are matched by colour too. Adding points does not move the
+    surface at once: ``surface`` brings links up to date.
     """
 
-    def __init__(self, skeleton: Skeleton) -> None:
+    def __init__(self, skeleton: Skeleton, match_colours: bool = False) -> None:
         self.skeleton = skeleton
+        self.match_colours = match_colours
         self._cells = [_LinkCells() for _ in range(LINK_COUNT)]
-        self._grids: list[tuple[LinkGrid, Array] | None] = [None] * LINK_COUNT
+        self._grids: list[_LinkSurface | None] = [None] * LINK_COUNT
         self._stale = list(range(LINK_COUNT))  # longest waiting first
         self._surface: Surface | None = None
 
@@ -117,7 +119,7 @@ class BodyModel:
             if np.any(in_link[row]):
                 cells.shift(-in_link[row])
                 if entry is not None:
-                    self._grids[row] = shifted(entry[0], -in_link[row]), entry[1]
+                    self._grids[row] = entry._replace(grid=shifted(entry.grid, -in_link[row]))
         self._surface = None
 
     def surface(self, refreshed_links: int = LINK_COUNT) -> Surface:
@@ -127,12 +129,13 @@ class BodyModel:
         waiting = [link for link in self._stale if self._grids[link] is not None]
         renewed = missing + waiting[: max(refreshed_links - len(missing), 0)]
         for link in renewed:
-            points, normals, rigidity = self._cells[link].surface()
-            self._grids[link] = build_link_grid(points, normals, GRID_CELL_M, GRID_MARGIN_M), rigidity
+            points, normals, rigidity, colours = self._cells[link].surface()
+            grid = build_link_grid(points, normals, GRID_CELL_M, GRID_MARGIN_M)
+            self._grids[link] = _LinkSurface(grid, rigidity.astype(np.float32), tints(colours))
         self._stale = [link for link in self._stale if link not in renewed]
         if renewed or self._surface is None:
             ready = [entry for entry in self._grids if entry is not None]
-            self._surface = _join([grid for grid, _ in ready], [rigidity for _, rigidity in ready])
+            self._surface = _join(ready, self.match_colours)
         return self._surface
 
     def to_bytes(self) -> bytes:
@@ -179,6 +182,14 @@ class BodyModel:
         for cells, end, count in zip(body._cells, ends, counts, strict=True):
             cells.restore(sums[end - count : end].astype(np.float64))
         return body
+
+
+class _LinkSurface(NamedTuple):
+    """A link's grid, and of its M points the rigidities (M,) and tints (M, 2), both float32."""
+
+    grid: LinkGrid
+    rigidity: Array
+    tints: Array
 
 
 def _read_archive(data: bytes) -> tuple[Array, ...]:
@@ -251,9 +262,9 @@ class _LinkCells:
         self.sums = np.zeros((len(self.keys), _COLUMNS))
         _add_rows(rows, sums, self.sums)
 
-    def surface(self) -> tuple[Array, Array, Array]:
-        """Points (M, 3) [m, link frame], unit normals (M, 3) and rigidities (M,) of the cells that were seen often
-        enough: noise leaves cells that were hit once or twice around the true surface. A thick shell, as
+    def surface(self) -> tuple[Array, Array, Array, Array]:
+        """Points (M, 3) [m, link frame], unit normals (M, 3), rigidities (M,) and colours (M, 3) of the cells that were
+        seen often enough: noise leaves cells that were hit once or twice around the true surface. A thick shell, as
         noise of a centimetre leaves it, is thinned to one sheet in its middle."""
         often = self._often()
         sums = self.sums[often]
@@ -261,7 +272,7 @@ class _LinkCells:
             sums = _sheet(self.keys, self.sums, often)
         count = sums[:, _COUNT:]
         normals = sums[:, _NORMAL] / np.maximum(np.linalg.norm(sums[:, _NORMAL], axis=1, keepdims=True), 1e-9)
-        return sums[:, _POSITION] / count, normals, sums[:, _RIGID] / count[:, 0]
+        return sums[:, _POSITION] / count, normals, sums[:, _RIGID] / count[:, 0], sums[:, _COLOUR] / count
 
 
 @njit(nogil=True, cache=True)
@@ -331,7 +342,8 @@ def _cell_keys(points: Array, normals: Array) -> Array:
     return (((facing << 18 | cell[:, 0]) << 18 | cell[:, 1]) << 18) | cell[:, 2]
 
 
-def _join(grids: list[LinkGrid], rigidity: list[Array]) -> Surface:
+def _join(links: list[_LinkSurface], match_colours: bool) -> Surface:
+    grids = [link.grid for link in links]
     counts = np.array([len(grid.points) for grid in grids])
     cells = np.array([grid.nearest.size for grid in grids])
     low, high = np.ones((LINK_COUNT, 3), np.float32), np.zeros((LINK_COUNT, 3), np.float32)
@@ -341,7 +353,7 @@ def _join(grids: list[LinkGrid], rigidity: list[Array]) -> Surface:
     return Surface(
         points=np.concatenate([grid.points for grid in grids]),
         normals=np.concatenate([grid.normals for grid in grids]),
-        weights=np.concatenate(rigidity).astype(np.float32),
+        weights=np.concatenate([link.rigidity for link in links]),
         first_point=np.cumsum(counts) - counts,
         origin=np.stack([grid.origin for grid in grids]),
         shape=np.array([grid.nearest.shape[1:] for grid in grids], np.int64),
@@ -351,6 +363,7 @@ def _join(grids: list[LinkGrid], rigidity: list[Array]) -> Surface:
         low=low,
         high=high,
         spacing2_m2=np.array([grid.spacing2_m2 for grid in grids], np.float32),
+        tints=np.concatenate([link.tints for link in links]) if match_colours else np.empty((0, 2), np.float32),
     )
 
 

@@ -3,6 +3,7 @@
 The points of a link never move in the link's own frame, so for every cell of a grid around them the nearest point is
 found once. Each cell has six answers, one for each main direction of a normal: a forearm that jumped further than its
 own radius still finds its near side and not the far one (the normal clusters of Lien 2009 §5.1.3 in a table).
+Links compete for a point by distance, and by colour: a hand before a chest is told from it by its skin.
 """
 
 from __future__ import annotations
@@ -20,6 +21,8 @@ BIN_COSINE = 0.25  # a point is in every bin whose direction is within 75° of i
 NEAR_LINKS = 12  # candidate links a point may have
 SPACING_SAMPLES = 40
 NORMAL_GATE = 0.35  # least cosine between the normals of a point and its match
+TINT_M = 0.15  # a match whose tint differs by 1 counts as this far away: skin and cloth (0.1 to 0.2) as 2 to 3 cm
+TINT_FLOOR = 40.0  # grey levels added to a colour's brightness: dark points have no tint worth the name
 MAX_CELLS = 3_500  # of each main direction: large links get coarser cells, which their flat surfaces allow
 
 
@@ -154,7 +157,8 @@ class Surface(NamedTuple):
     ``first_point`` (L,) int64; ``origin`` (L, 3) float32 [m]; ``shape`` (L, 3) int64; ``cells_per_m`` (L,) float32;
     ``first_cell`` (L,) int64; ``nearest`` (C,) int16, see ``closest_point_grid``;
     ``low, high`` (L, 3) float32 [m, link frame]: box around the link's points; low > high when it has none;
-    ``spacing2_m2`` (L,) float32 [m²]: mean squared distance of a link's point from its nearest neighbour.
+    ``spacing2_m2`` (L,) float32 [m²]: mean squared distance of a link's point from its nearest neighbour;
+    ``tints`` (M, 2) float32, or (0, 2): colours do not count.
     """
 
     points: Array
@@ -169,6 +173,20 @@ class Surface(NamedTuple):
     low: Array
     high: Array
     spacing2_m2: Array
+    tints: Array
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def tints(colours: Array) -> Array:
+    """Tints (N, 2) float32 of ``colours`` (N, 3) RGB 0..255: shares of red and green. They do not depend on how much
+    light falls on a surface nor on the exposure, but for points that are nearly black."""
+    out = np.empty((len(colours), 2), np.float32)
+    for n in range(len(colours)):
+        red, green, blue = float(colours[n, 0]), float(colours[n, 1]), float(colours[n, 2])
+        brightness = red + green + blue + TINT_FLOOR
+        out[n, 0] = (red + TINT_FLOOR / 3.0) / brightness
+        out[n, 1] = (green + TINT_FLOOR / 3.0) / brightness
+    return out
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
@@ -204,10 +222,13 @@ def near_links(points: Array, R: Array, t: Array, surface: Surface, gate: float,
 
 @njit(nogil=True, cache=True, error_model="numpy")
 def _closest_point(
-    points: Array, normals: Array, near: Array, n: int, R: Array, t: Array, surface: Surface
+    points: Array, normals: Array, tinted: Array, near: Array, n: int, R: Array, t: Array, surface: Surface
 ) -> tuple[int, int, np.float32]:
     """Of point n: link, row and squared distance [m²] of the closest compatible model point; link -1: there is none."""
-    zero = np.float32(0.0)  # single precision throughout: this is where the time goes
+    zero, tint2_m2 = (
+        np.float32(0.0),
+        np.float32(TINT_M * TINT_M),
+    )  # single precision throughout: this is where the time goes
     best_link, best_point, best = -1, -1, np.float32(np.inf)
     for c in range(near.shape[1]):
         link = int(near[n, c])
@@ -244,6 +265,9 @@ def _closest_point(
         k += surface.first_point[link]
         ex, ey, ez = qx - surface.points[k, 0], qy - surface.points[k, 1], qz - surface.points[k, 2]
         d = ex * ex + ey * ey + ez * ez
+        if len(surface.tints):
+            ex, ey = tinted[n, 0] - surface.tints[k, 0], tinted[n, 1] - surface.tints[k, 1]
+            d += tint2_m2 * (ex * ex + ey * ey)
         if d >= best:
             continue
         if mx * surface.normals[k, 0] + my * surface.normals[k, 1] + mz * surface.normals[k, 2] < NORMAL_GATE:
@@ -254,13 +278,23 @@ def _closest_point(
 
 @njit(nogil=True, cache=True, error_model="numpy")
 def match_points(
-    points: Array, normals: Array, near: Array, R: Array, t: Array, surface: Surface, link: Array, row: Array, d2: Array
+    points: Array,
+    normals: Array,
+    tinted: Array,
+    near: Array,
+    R: Array,
+    t: Array,
+    surface: Surface,
+    link: Array,
+    row: Array,
+    d2: Array,
 ) -> None:
-    """Closest compatible model point of every point (N, 3): fills ``link`` (N,) int64 (-1: none), ``row`` (N,) int64
-    and the squared distance ``d2`` (N,) [m²]; ``R, t``: link frames in the world, from ``forward``."""
+    """Closest compatible model point of every point (N, 3) with its normal (N, 3) and tint (N, 2): fills ``link`` (N,)
+    int64 (-1: none), ``row`` (N,) int64 and the squared distance ``d2`` (N,) [m²], to which a difference in tint adds
+    as if it were one in place; ``R, t``: link frames in the world, from ``forward``."""
     R32, t32 = R.astype(np.float32), t.astype(np.float32)
     for n in range(len(points)):
-        link[n], row[n], d2[n] = _closest_point(points, normals, near, n, R32, t32, surface)
+        link[n], row[n], d2[n] = _closest_point(points, normals, tinted, near, n, R32, t32, surface)
         for c in range(1, near.shape[1]):  # asked first next time: its short distance rules the other boxes out
             if near[n, c] < 0 or link[n] < 0:
                 break

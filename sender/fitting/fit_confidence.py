@@ -16,6 +16,7 @@ SEEN_POINTS = 200.0  # with fewer explained points no pose is certain
 FORGETTING = 0.02  # per frame, of the usual share when a link shows less of itself, and of the usual score
 FIRST_FRAMES = 10
 NOISIEST = 0.22  # a score that is worse is not noise
+NOISY = 0.12  # usual score of clouds whose points scatter by more than 2 cm
 GOOD_RATIO, BAD_RATIO, LOST_RATIO = 1.15, 1.3, 1.6  # to the usual score
 _FOLLOWS = {"neck": "head"} | {
     f"{s}_{a}": f"{s}_{b}" for s in SIDES for a, b in (("fingers", "hand"), ("toes", "foot"))
@@ -50,6 +51,11 @@ class ScoreScale:
     def __init__(self, good: float, lost: float) -> None:
         self._good, self._lost = good, lost
         self._usual, self._frames = 0.0, 0
+
+    @property
+    def noisy(self) -> bool:
+        """Whether points scatter so much that a fit has to look further."""
+        return self._usual > NOISY
 
     @property
     def good(self) -> float:

@@ -6,6 +6,7 @@ the person was lost for a while. Everything depends only on the clouds and their
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -39,7 +40,8 @@ class GaussNewtonSettings:
     """``building_s``: how long the surface is gathered after the start pose. ``good_score``, ``lost_score``: mean
     robust cost per point (0..1) below which a pose is trusted, and above which the person counts as lost; ``lost_s``:
     for this long before looking again. ``stranger_s``: how long the known person is looked for before anybody else
-    will do. ``floor_y`` [m]: height of the floor, when known."""
+    will do. ``floor_y`` [m]: height of the floor, when known. ``match_colours``: whether a point goes rather to
+    surface of its own colour."""
 
     building_s: float = 1.5
     good_score: float = 0.095
@@ -47,6 +49,7 @@ class GaussNewtonSettings:
     lost_s: float = 1.0
     stranger_s: float = 2.0
     floor_y: float | None = None
+    match_colours: bool = False
 
 
 HYPOTHESES = (1.0, 0.5, 0.0)  # shares of the last velocity
@@ -54,6 +57,9 @@ GUESS = Schedule(1, 0.20, 0.10, 0.2, 1.0, 1.0)
 COARSE = Schedule(2, 0.15, 0.08, 0.1, 1.0, 1.0)
 FINE = Schedule(2, 0.08, 0.06, 0.1, 1.0, 1.0)
 GUESS_POINTS, COARSE_POINTS, FINE_POINTS = 250, 600, 1250
+NOISY_COARSE = Schedule(2, 0.20, 0.15, 0.1, 1.0, 1.0)  # for noisy clouds: the robust kernel is as wide as the noise
+NOISY_FINE = Schedule(3, 0.15, 0.12, 0.1, 1.0, 1.0)
+NOISY_FINE_POINTS = 2500
 RETRY_FRAMES = 5  # after a limb search in vain
 GUESSED_SIGMA_M, KNOWN_SIGMA_M = 0.04, 0.005  # of joint centres found by the automatic start, and of given ones
 
@@ -66,6 +72,8 @@ class GaussNewtonTracker:
         self._table = joint_table()
         self._limbs = limbs(self._table)
         self._body = body
+        if body is not None:
+            body.match_colours = settings.match_colours
         self._search: WholeBodySearch | None = None if body is None else WholeBodySearch(body, self._table)
         self._newcomer = InitialPoseSearch(settings.floor_y)
         self._state: PoseState | None = None
@@ -102,11 +110,11 @@ class GaussNewtonTracker:
         self, skeleton: Skeleton, pose: SkeletonPose, cloud: PointCloud, capture_ns: int, sigma_m: float
     ) -> FitResult:
         """A fresh body; ``sigma_m``: how well its joint centres are known."""
-        self._body = BodyModel(skeleton)
+        self._body = BodyModel(skeleton, self._settings.match_colours)
         self._body.add(cloud, forward_kinematics(skeleton, pose))
         self._begin(_state_of(pose), capture_ns, capture_ns + int(self._settings.building_s * 1e9), sigma_m)
-        fit = self._fitter().judge(thinned(cloud, FINE_POINTS), _state_of(pose))
-        return self._accept(fit, cloud, capture_ns)
+        judged = thinned(cloud, FINE_POINTS)
+        return self._accept(self._fitter().judge(judged, _state_of(pose)), cloud, judged, capture_ns)
 
     def track(self, cloud: PointCloud, capture_ns: int) -> FitResult | None:
         """The pose in ``cloud``; with too few points the last pose at confidence 0, or None before the start."""
@@ -115,7 +123,8 @@ class GaussNewtonTracker:
         self._frames += 1
         if self._state is None:
             return self._look(cloud, capture_ns)
-        fit = self._follow(cloud, capture_ns)
+        judged = thinned(cloud, NOISY_FINE_POINTS if self._scale.noisy else FINE_POINTS)
+        fit = self._follow(cloud, judged, capture_ns)
         self._scale.update(fit.score)
         if fit.score < self._scale.lost:
             self._good_ns = capture_ns
@@ -123,7 +132,7 @@ class GaussNewtonTracker:
             self._state = None
             self._status = "lost: looking for the person"
             return self._unseen()
-        return self._accept(fit, cloud, capture_ns)
+        return self._accept(fit, cloud, judged, capture_ns)
 
     def _nobody(self, points: int, capture_ns: int) -> FitResult | None:
         """Nobody to see; who comes after a while may be somebody else, and is looked at afresh."""
@@ -140,9 +149,10 @@ class GaussNewtonTracker:
         if self._search is not None:
             found = self._search.step(cloud)
             if self._search.recognises(found, cloud):
-                fit = self._fitter().judge(thinned(cloud, FINE_POINTS), found.pose)
+                judged = thinned(cloud, FINE_POINTS)
+                fit = self._fitter().judge(judged, found.pose)
                 self._begin(fit.pose, capture_ns, 0, KNOWN_SIGMA_M)
-                return self._accept(fit, cloud, capture_ns)
+                return self._accept(fit, cloud, judged, capture_ns)
             self._status = f"looking for the known person: best score {found.score:.2f}"
             if capture_ns - self._looking_since_ns < self._settings.stranger_s * 1e9:
                 return self._unseen()
@@ -165,19 +175,19 @@ class GaussNewtonTracker:
         self._good_ns = capture_ns
         self._looking_since_ns = None
 
-    def _follow(self, cloud: PointCloud, capture_ns: int) -> FitArrays:
+    def _follow(self, cloud: PointCloud, judged: PointCloud, capture_ns: int) -> FitArrays:
         """Velocity hypotheses on a tenth of the points, coarse then fine fit of the best, then what got lost."""
         fitter = self._fitter()
         frames_passed = float(np.clip((capture_ns - self._times_ns[0]) / FRAME_NS, 1.0, 4.0))
-        guess, coarse, fine = (plan._replace(step_scale=frames_passed) for plan in (GUESS, COARSE, FINE))
-        some, judged = thinned(cloud, GUESS_POINTS), thinned(cloud, FINE_POINTS)
+        plans = (GUESS, NOISY_COARSE, NOISY_FINE) if self._scale.noisy else (GUESS, COARSE, FINE)
+        guess, coarse, fine = (plan._replace(step_scale=frames_passed) for plan in plans)
+        some = thinned(cloud, GUESS_POINTS)
         guesses = self._predicted(capture_ns)
         fits = [fitter.fit(some, start, start, guess) for start in guesses]
         best = min(range(len(fits)), key=lambda k: fits[k].score)
         predicted = guesses[best]
         pose = fitter.move(thinned(cloud, COARSE_POINTS), fits[best].pose, predicted, coarse)
-        fit = fitter.fit(judged, pose, predicted, fine)
-        return self._recovered(fit, judged, fitter)
+        return self._recovered(fitter.fit(judged, pose, predicted, fine), judged, fitter)
 
     def _recovered(self, fit: FitArrays, cloud: PointCloud, fitter: BodyFitter) -> FitArrays:
         """The fit, or a better one: one limb is looked for at a time, or else the whole body when it fits badly."""
@@ -239,8 +249,9 @@ class GaussNewtonTracker:
         left_over = within_reach(limb, joints, fitter.offsets, cloud) & (fit.owner < 0)
         return bool(left_over.sum() >= 0.4 * usual)
 
-    def _accept(self, fit: FitArrays, cloud: PointCloud, capture_ns: int) -> FitResult:
-        """Takes the fit as the new state, lets the model learn from it, and says how it went."""
+    def _accept(self, fit: FitArrays, cloud: PointCloud, judged: PointCloud, capture_ns: int) -> FitResult:
+        """Takes the fit as the new state, lets the model learn from it, and says how it went; ``judged``: the points of
+        the fit."""
         skeleton = self._known_body().skeleton
         rotations = quaternion.from_matrix(fit.pose.local)
         local = quaternion.to_matrix(rotations)  # rounding must not add up over frames
@@ -255,7 +266,7 @@ class GaussNewtonTracker:
         building = self._learning.building(capture_ns)
         self._status = "tracking, learning the surface" if building else "tracking"
         if good:
-            self._learning.frame(fit, pose, cloud, thinned(cloud, FINE_POINTS), capture_ns)
+            self._learning.frame(fit, pose, cloud, judged, capture_ns)
         self._result = FitResult(
             skeleton=skeleton,
             pose=pose,
@@ -274,6 +285,11 @@ class GaussNewtonTracker:
         last = self._result
         pose = SkeletonPose(last.pose.root_position, last.pose.rotations, np.zeros(LINK_COUNT, np.float32))
         return FitResult(last.skeleton, pose, False, 0, 0.0, 0.0, 0.0)
+
+
+GAUSS_NEWTON_ABLATIONS: dict[str, Callable[[BodyModel | None], GaussNewtonTracker]] = {
+    "gauss-newton-colours": lambda body: GaussNewtonTracker(GaussNewtonSettings(match_colours=True), body),
+}
 
 
 def _state_of(pose: SkeletonPose) -> PoseState:

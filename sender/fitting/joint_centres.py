@@ -27,7 +27,7 @@ from sender.fitting.articulated_gauss_newton import (
     project,
 )
 from sender.fitting.body_fitter import BodyFitter
-from sender.fitting.closest_point_grid import NEAR_LINKS, Surface, match_points, near_links
+from sender.fitting.closest_point_grid import NEAR_LINKS, Surface, match_points, near_links, tints
 from sender.fitting.joint_limits import JointTable, add_priors
 
 Array = NDArray[Any]
@@ -61,7 +61,8 @@ class JointCentres:
     def observe(self, cloud: PointCloud, state: PoseState, fitter: BodyFitter) -> None:
         """Adds what ``cloud`` (N points, world) says; ``state``: its fitted pose."""
         A, b = _linearised(
-            cloud.positions, cloud.normals, state, fitter.offsets, fitter.surface, fitter.table, JOINTS
+            cloud.positions, cloud.normals, tints(cloud.colours), state, fitter.offsets, fitter.surface, fitter.table,
+            JOINTS,
         )  # fmt: skip
         pose = len(b) - len(self._pull)
         through_pose = np.linalg.solve(A[:pose, :pose], np.column_stack([A[:pose, pose:], b[:pose]]))
@@ -102,7 +103,14 @@ def _start_information(sigma_m: float) -> Array:
 
 @njit(nogil=True, cache=True, error_model="numpy")
 def _linearised(
-    points: Array, normals: Array, state: PoseState, offsets: Array, surface: Surface, table: JointTable, joints: Array
+    points: Array,
+    normals: Array,
+    tinted: Array,
+    state: PoseState,
+    offsets: Array,
+    surface: Surface,
+    table: JointTable,
+    joints: Array,
 ) -> tuple[Array, Array]:
     """Normal equations A (K, K), b (K,) of one cloud: pose axes first, then the displacements of ``joints``."""
     R, t = forward(state.root, state.local, offsets, table.parents)
@@ -110,7 +118,7 @@ def _linearised(
     near = np.empty((count, NEAR_LINKS), np.int8)
     link, row, d2 = np.empty(count, np.int64), np.empty(count, np.int64), np.empty(count)
     near_links(points, R, t, surface, GATE_M, near)
-    match_points(points, normals, near, R, t, surface, link, row, d2)
+    match_points(points, normals, tinted, near, R, t, surface, link, row, d2)
     H, g = np.empty((len(R), 6, 6)), np.empty((len(R), 6))
     normal_equations(points, link, row, d2, R, t, surface, GATE_M, POINT_SHARE, H, g)
     size = pose + 6 * len(joints)

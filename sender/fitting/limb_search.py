@@ -24,7 +24,7 @@ from sender.fitting.articulated_gauss_newton import (
     forward,
 )
 from sender.fitting.body_fitter import BodyFitter
-from sender.fitting.closest_point_grid import Surface, match_points
+from sender.fitting.closest_point_grid import Surface, match_points, tints
 from sender.fitting.joint_limits import JointTable
 
 Array = NDArray[Any]
@@ -103,8 +103,8 @@ def search_limb(
     turned = [nearby_poses(limb, state.local, fitter.table) for state in states]
     poses = np.concatenate([*known, *turned, limb.poses])
     costs = score_poses(
-        cloud.positions[rows], cloud.normals[rows], R, t, limb.links, poses, fitter.offsets, fitter.surface,
-        fitter.table.parents,
+        cloud.positions[rows], cloud.normals[rows], tints(cloud.colours[rows]), R, t, limb.links, poses, fitter.offsets,
+        fitter.surface, fitter.table.parents,
     )  # fmt: skip
     some = thinned(cloud, RETRY_POINTS)
     best, best_score = fit.pose, CLEARLY_BETTER * fitter.judge(some, fit.pose).score
@@ -148,6 +148,7 @@ def thinned(cloud: PointCloud, count: int) -> PointCloud:
 def score_poses(
     points: Array,
     normals: Array,
+    tinted: Array,
     R: Array,
     t: Array,
     links: Array,
@@ -156,8 +157,9 @@ def score_poses(
     surface: Surface,
     parents: Array,
 ) -> Array:
-    """Mean robust cost (K,) 0..1 of ``points, normals`` (N, 3) [m, world] against one limb in each of ``poses``
-    (K, 3, 3, 3); ``R, t``: the body's link rotations (L, 3, 3) and joints (L, 3), overwritten for ``links``."""
+    """Mean robust cost (K,) 0..1 of ``points, normals`` (N, 3) [m, world], ``tinted`` (N, 2), against one limb in each
+    of ``poses`` (K, 3, 3, 3); ``R, t``: the body's link rotations (L, 3, 3) and joints (L, 3), overwritten for
+    ``links``."""
     cost = np.zeros(len(poses))
     near = np.empty((len(points), len(links)), np.int8)
     near[:] = links
@@ -172,7 +174,7 @@ def score_poses(
                     R[link, i, j] = 0.0
                     for m in range(3):
                         R[link, i, j] += R[up, i, m] * poses[k, c, m, j]
-        match_points(points, normals, near, R, t, surface, hit, row, d2)
+        match_points(points, normals, tinted, near, R, t, surface, hit, row, d2)
         for n in range(len(points)):
             cost[k] += d2[n] / (d2[n] + INLIER_M**2) if hit[n] >= 0 else 1.0
         cost[k] /= max(len(points), 1)

@@ -17,6 +17,7 @@ from common.geometry import quaternion
 from common.geometry.point_cloud import PointCloud
 from sender.fitting.articulated_gauss_newton import FitArrays, PoseState, Schedule, forward
 from sender.fitting.body_fitter import BodyFitter
+from sender.fitting.closest_point_grid import tints
 from sender.fitting.joint_limits import JointTable
 from sender.fitting.limb_search import (
     CLEARLY_BETTER,
@@ -68,8 +69,8 @@ class LimbRecovery:
         rows = rows[:: max(len(rows) // SCORED_POINTS, 1)]
         poses = self._spread(fit.pose, fitter.table)
         costs = score_poses(
-            cloud.positions[rows], cloud.normals[rows], R, t, self.limb.links, poses, fitter.offsets, fitter.surface,
-            fitter.table.parents,
+            cloud.positions[rows], cloud.normals[rows], tints(cloud.colours[rows]), R, t, self.limb.links, poses,
+            fitter.offsets, fitter.surface, fitter.table.parents,
         )  # fmt: skip
         self._kept = heaviest = poses[np.argsort(costs, kind="stable")[:LIMB_KEPT]]
         self._layer += 1
