@@ -67,15 +67,17 @@ class TrackingSettings:
 @dataclass(frozen=True, slots=True)
 class CandidateSettings:
     """Candidate poses. ``choice``: what is sent next, by "coverage" or by the "paper"'s χ. ``interval_ms``: time
-    between two that are considered. ``least_confidence``: of a fit, for its frame to become one. ``jpeg_quality``,
-    ``depth_step_mm``: how finely a view is sent; the ``thin_`` ones where a pose would take long. ``send_log``: a
-    file that gets a JSON line for every send. ``fused_frames``: so many frames are averaged into a pose's depth.
-    ``segmentation``: what belongs to which link. ``views``: one surface of all cameras, or one for each.
-    ``region_weights``: ω where it is not the default; ``score_form``: what σ divides by."""
+    between two that are considered; ``busy_share``: at most this share of the time is spent on making them.
+    ``least_confidence``: of a fit, for its frame to become one. ``jpeg_quality``, ``depth_step_mm``: how finely a view
+    is sent; the ``thin_`` ones where a pose would take long. ``send_log``: a file that gets a JSON line for every send.
+    ``fused_frames``: so many frames are averaged into a pose's depth. ``segmentation``: what belongs to which link.
+    ``views``: one surface of all cameras, or one for each. ``region_weights``: ω where it is not the default;
+    ``score_form``: what σ divides by."""
 
     enabled: bool = True
     choice: Literal["coverage", "paper"] = "coverage"
     interval_ms: float = 200.0
+    busy_share: float = 0.25
     least_confidence: float = 0.5
     jpeg_quality: int = 85
     depth_step_mm: int = 2
@@ -91,6 +93,8 @@ class CandidateSettings:
     def __post_init__(self) -> None:
         if not 0 <= self.interval_ms <= 60_000:
             raise ValueError(f"interval_ms: {self.interval_ms} is outside 0..60000")
+        if not 0.01 <= self.busy_share <= 1:
+            raise ValueError(f"busy_share: {self.busy_share} is outside 0.01..1")
         if not 0 <= self.least_confidence <= 1:
             raise ValueError(f"least_confidence: {self.least_confidence} is outside 0..1")
         for name in ("jpeg_quality", "thin_jpeg_quality"):

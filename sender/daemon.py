@@ -21,6 +21,7 @@ from common.runtime.run_statistics import RunStatistics, write_statistics
 from common.runtime.stage_timer import StageTimer
 from common.transport.zenoh_session import ZenohSession, open_session, with_endpoints
 from sender.body_store import BodyStore
+from sender.candidate_poses.candidate_pace import CandidatePace
 from sender.candidate_poses.mesh_scheduler import MeshScheduler, SendRecord
 from sender.capture.capture_thread import CaptureThread
 from sender.capture.frame_set import CaptureError, FrameSet, FrameSource
@@ -158,7 +159,7 @@ class _Stream:
         self._capture = CaptureThread(source, self._synchronizer, deliver, clock)
         self._last_status = ""
         self._next_save_ns: int | None = None
-        self._next_candidate_ns = 0
+        self._pace = CandidatePace(int(settings.poses.interval_ms * 1e6), settings.poses.busy_share)
         self._published = 0
         self._poses_sent = 0
         self._skeleton_bytes_max = 0
@@ -231,13 +232,15 @@ class _Stream:
         self._timer.add("capture to publish", self._clock.now_ns() - tracked.capture_ns)
         if self._settings.poses.enabled:
             self._candidates.remember(tracked)
-            if tracked.capture_ns >= self._next_candidate_ns and self._candidates.may_become_one(tracked):
-                self._next_candidate_ns = tracked.capture_ns + int(self._settings.poses.interval_ms * 1e6)
+            now_ns = self._clock.now_ns()
+            if self._pace.due(tracked.capture_ns, now_ns) and self._candidates.may_become_one(tracked):
+                self._pace.begin(tracked.capture_ns, now_ns)
                 self._candidates.note_budget(self._scheduler.budget_bytes)
                 self._meshing.submit(tracked)
 
     def _on_candidates(self, found: Candidates) -> None:
         """On the loop: what may be sent now."""
+        self._pace.done(self._clock.now_ns())
         self._scheduler.offer(found.pose_id, found.encoded, found.capture_ns, found.worth, found.preview)
         self._candidate_bytes.append(len(found.encoded))
         self._links.wake()
