@@ -33,7 +33,7 @@ MEMORY_FRAMES = 90.0  # a cell forgets what is older than about this many observ
 RARE = 0.3  # of the median count of a link's cells: fewer observations are noise
 UNSEEN_REACH = 1.5  # radii from the bone: what is further away may be anything
 CONFIRMED, FADING = 2.0, 0.97  # observations that make a late side surface; what is left of the others each time
-SEAM_WEIGHT = 0.4  # points a neighbouring link also claims bend with the joint and follow neither link well
+SEAM_WEIGHT = 1.0  # of points that a neighbouring link also claims: they bend with the joint, and help all the same
 SEAM_RATIO = 1.35  # claimed by both when the second bone is at most this much further, in radii
 
 _UNSPLIT = {"fingers": "hand", "toes": "foot"}  # locked joints: their points belong to the link that moves them

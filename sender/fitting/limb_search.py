@@ -92,7 +92,8 @@ def search_limb(
     limb: Limb, fit: FitArrays, cloud: PointCloud, fitter: BodyFitter, also: tuple[PoseState, ...]
 ) -> PoseState:
     """The best of ``fit`` and its retries with the limb turned, as it is in ``also``, or anywhere; ``fit.pose`` itself
-    when nothing explains the cloud clearly better."""
+    when nothing explains the cloud clearly better. ``fit`` was judged on this ``cloud``, and so are the retries, which
+    are fitted to fewer points: any pose looks better on just the points it was fitted to."""
     R, t = forward(fit.pose.root, fit.pose.local, fitter.offsets, fitter.table.parents)
     rows = free_rows(limb, fit, t, fitter.offsets, cloud)
     if len(rows) < 10:
@@ -107,10 +108,10 @@ def search_limb(
         fitter.surface, fitter.table.parents,
     )  # fmt: skip
     some = thinned(cloud, RETRY_POINTS)
-    best, best_score = fit.pose, CLEARLY_BETTER * fitter.judge(some, fit.pose).score
+    best, best_score = fit.pose, CLEARLY_BETTER * fit.score
     for k in np.argsort(costs, kind="stable")[:RETRIES]:
         start = with_limb(fit.pose, limb, poses[k])
-        retry = fitter.fit(some, start, start, RETRY)
+        retry = fitter.judge(cloud, fitter.move(some, start, start, RETRY))
         if retry.score < best_score:
             best, best_score = retry.pose, retry.score
     return best

@@ -59,8 +59,8 @@ class LimbRecovery:
         return self._layer >= len(LAYERS)
 
     def step(self, fit: FitArrays, cloud: PointCloud, fitter: BodyFitter) -> PoseState | None:
-        """One layer on ``cloud`` (N points, world), whose best pose so far is ``fit``: a clearly better pose or None;
-        ``fit.owner`` tells of these N points which are explained."""
+        """One layer on ``cloud`` (N points, world), whose best pose so far is ``fit``, judged on it: a clearly better
+        pose or None; ``fit.owner`` tells of these N points which are explained."""
         R, t = forward(fit.pose.root, fit.pose.local, fitter.offsets, fitter.table.parents)
         rows = free_rows(self.limb, fit, t, fitter.offsets, cloud)
         if len(rows) < 10:
@@ -96,12 +96,15 @@ class LimbRecovery:
 
 
 def _polished(limb: Limb, poses: Array, fit: FitArrays, cloud: PointCloud, fitter: BodyFitter) -> PoseState | None:
-    """The best of ``poses`` (K, 3, 3, 3) after Gauss–Newton, if it explains the cloud clearly better than ``fit``."""
+    """The best of ``poses`` (K, 3, 3, 3) after Gauss–Newton, if it explains the cloud clearly better than ``fit``.
+
+    Few points are fitted but all are judged: any pose looks better on just the points it was fitted to.
+    """
     some = thinned(cloud, RETRY_POINTS)
-    best, best_score = None, CLEARLY_BETTER * fitter.judge(some, fit.pose).score
+    best, best_score = None, CLEARLY_BETTER * fit.score
     for pose in poses:
         start = with_limb(fit.pose, limb, pose)
-        retry = fitter.fit(some, start, start, RETRY)
+        retry = fitter.judge(cloud, fitter.move(some, start, start, RETRY))
         if retry.score < best_score:
             best, best_score = retry.pose, retry.score
     return best
