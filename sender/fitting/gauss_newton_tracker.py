@@ -24,15 +24,14 @@ from sender.fitting.body_model import BodyModel
 from sender.fitting.fit_confidence import FitConfidence, ScoreScale
 from sender.fitting.initial_pose import NoPose
 from sender.fitting.initial_pose_search import InitialPoseSearch
-from sender.fitting.joint_limits import joint_table, turned_on
+from sender.fitting.joint_limits import joint_table
 from sender.fitting.limb_search import CLEARLY_BETTER, Limb, limbs, thinned, within_reach
 from sender.fitting.particle_recovery import BodyRecovery, LimbRecovery
-from sender.fitting.tracker import MINIMUM_POINTS, FitResult
+from sender.fitting.pose_prediction import FRAME_NS, LossTimer, predicted_poses
+from sender.fitting.tracker import MINIMUM_POINTS, FitResult, untrusted
 from sender.fitting.whole_body_search import WholeBodySearch
 
 Array = NDArray[Any]
-
-FRAME_NS = 1e9 / 30.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,7 +86,7 @@ class GaussNewtonTracker:
         self._body_recovery: BodyRecovery | None = None
         self._result: FitResult | None = None
         self._looking_since_ns: int | None = None
-        self._good_ns = 0
+        self._loss = LossTimer(settings.lost_s)
         self._frames = 0
         self._retry_after = np.zeros(LINK_COUNT, np.int64)
         self._status = "looking for a person"
@@ -127,8 +126,8 @@ class GaussNewtonTracker:
         fit = self._follow(cloud, judged, capture_ns)
         self._scale.update(fit.score)
         if fit.score < self._scale.lost:
-            self._good_ns = capture_ns
-        elif capture_ns - self._good_ns > self._settings.lost_s * 1e9:
+            self._loss.seen_well(capture_ns)
+        elif self._loss.lost(capture_ns):
             self._state = None
             self._status = "lost: looking for the person"
             return self._unseen()
@@ -136,7 +135,7 @@ class GaussNewtonTracker:
 
     def _nobody(self, points: int, capture_ns: int) -> FitResult | None:
         """Nobody to see; who comes after a while may be somebody else, and is looked at afresh."""
-        if capture_ns - self._good_ns > self._settings.lost_s * 1e9:
+        if self._loss.lost(capture_ns):
             self._state = None
         self._looking_since_ns = None
         self._status = f"{points} points: nobody to see"
@@ -172,7 +171,7 @@ class GaussNewtonTracker:
         self._scale = ScoreScale(self._settings.good_score, self._settings.lost_score)
         self._learning = BodyLearning(body, self._table, building_until_ns, sigma_m)
         self._limb_recovery, self._body_recovery = None, None
-        self._good_ns = capture_ns
+        self._loss.seen_well(capture_ns)
         self._looking_since_ns = None
 
     def _follow(self, cloud: PointCloud, judged: PointCloud, capture_ns: int) -> FitArrays:
@@ -218,17 +217,9 @@ class GaussNewtonTracker:
         return fit
 
     def _predicted(self, capture_ns: int) -> list[PoseState]:
-        """The state moved on at each share of its velocity, scaled to the time passed; twists stay: a straight limb
-        does not show its twist, so its velocity is noise."""
         assert self._state is not None
-        now, before = self._state, self._before
-        past_ns = self._times_ns[0] - self._times_ns[1]
-        if before is None or past_ns <= 0:
-            return [now]
-        ahead = np.clip((capture_ns - self._times_ns[0]) / past_ns, 0.0, 3.0) * np.array(HYPOTHESES)
-        turns = turned_on(before.local, now.local, ahead, self._table.twist_axis)
-        roots = now.root + ahead[:, None] * (now.root - before.root)
-        return [PoseState(root, local) for root, local in zip(roots, turns, strict=True)]
+        axis = self._table.twist_axis
+        return predicted_poses(self._state, self._before, self._times_ns, capture_ns, HYPOTHESES, axis)
 
     def _fitter(self) -> BodyFitter:
         return BodyFitter(self._known_body(), self._table)
@@ -280,11 +271,7 @@ class GaussNewtonTracker:
 
     def _unseen(self) -> FitResult | None:
         """The last pose, not to be trusted; None when there never was one."""
-        if self._result is None:
-            return None
-        last = self._result
-        pose = SkeletonPose(last.pose.root_position, last.pose.rotations, np.zeros(LINK_COUNT, np.float32))
-        return FitResult(last.skeleton, pose, False, 0, 0.0, 0.0, 0.0)
+        return None if self._result is None else untrusted(self._result)
 
 
 GAUSS_NEWTON_ABLATIONS: dict[str, Callable[[BodyModel | None], GaussNewtonTracker]] = {
