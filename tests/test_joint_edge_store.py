@@ -11,7 +11,6 @@ from common.body.distortion_score import distortion_score
 from common.body.joint_edge_store import FIRST_EDGES, JointEdgeStore
 from common.body.joint_edges import joint_edges
 from common.body.rigged_mesh import RiggedMesh
-from common.geometry.triangle_mesh import TriangleMesh
 from tests.capsule_views import arms_down_by, captured, links_of
 
 WEIGHTS = default_region_weights()
@@ -43,8 +42,8 @@ def test_it_stops_at_the_first_below_the_limit() -> None:
 def test_a_pose_without_edges_cannot_be_judged() -> None:
     store = filled(range(1))
     mesh: RiggedMesh = MESHES[0]
-    none = TriangleMesh(mesh.mesh.vertices, mesh.mesh.faces[:0], mesh.mesh.uv, mesh.mesh.texture)
-    store.add(7, joint_edges(none, np.zeros(len(mesh.mesh.vertices), np.uint8), mesh.T_link_world))
+    vertices, none = mesh.mesh.vertices, mesh.mesh.faces[:0]
+    store.add(7, joint_edges(vertices, none, np.zeros(len(vertices), np.uint8), mesh.T_link_world))
     assert store.scores([7, 0], TARGET)[0] == np.inf
 
 

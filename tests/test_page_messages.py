@@ -89,7 +89,7 @@ def test_pose_message_holds_the_mesh(mesh: RiggedMesh) -> None:
     np.testing.assert_array_equal(index, mesh.faces_drawn)
     assert texture is not None
     assert texture.shape == mesh.mesh.texture.shape
-    assert np.abs(texture.astype(int) - mesh.mesh.texture).max() <= 3
+    assert cv2.PSNR(texture, mesh.mesh.texture) > 40  # hard edges between flat colours ring a little in a JPEG
 
 
 def test_texture_keeps_the_colour_of_single_pixels() -> None:
