@@ -257,13 +257,13 @@ class Ceiling(_Animated):
     """The newest capture, no limit: what the cameras and the mesher can do at best."""
 
     def frame(self, k: int, captured: CapturedFrame) -> None:
-        """Shown where it was captured; meshed only when looked at."""
+        """Shown where it was captured; meshed only when looked at, of what there was then."""
         self._remember(k, captured)
         if (fitted := posed(captured, self.own)) is not None and fitted[2] >= LEAST_CONFIDENCE and captured.views:
-            self.screen = Screen(k, partial(self._picture, k, captured))
+            self.screen = Screen(k, partial(self._picture, k, captured, self._fusion.copy()))
 
-    def _picture(self, k: int, captured: CapturedFrame, cameras: list[Camera]) -> list[Picture]:
-        encoded = encoded_candidate(1, k, captured, self.own, self._fusion)
+    def _picture(self, k: int, captured: CapturedFrame, fusion: DepthFusion, cameras: list[Camera]) -> list[Picture]:
+        encoded = encoded_candidate(1, k, captured, self.own, fusion)
         assert encoded is not None
         still = np.tile(np.eye(3, 4, dtype=np.float32), (LINK_COUNT, 1, 1))
         return animated_picture(mesh_of(encoded, 0).mesh, still, cameras)

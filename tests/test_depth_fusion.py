@@ -15,6 +15,7 @@ from common.body.view import View
 from sender.reconstruction.depth_fusion import DepthFusion, PosedViews
 
 NOISE_MM = 6.0
+STEP_MM = 45
 
 
 def clean_depth() -> NDArray[np.uint16]:
@@ -22,7 +23,8 @@ def clean_depth() -> NDArray[np.uint16]:
 
 
 def noisy_frame(seed: int, shift_m: float = 0.0, posed_shift_m: float | None = None) -> PosedViews:
-    """A mannequin moved towards the camera by ``shift_m``, as its skeleton says or as ``posed_shift_m`` says."""
+    """A mannequin moved towards the camera by ``shift_m``, as its skeleton says or as ``posed_shift_m`` says; the
+    higher the seed, the longer ago."""
     skeleton, pose = mannequin()
     camera = mannequin_camera()
     forward = camera.T_world_camera[:3, 2]
@@ -32,7 +34,7 @@ def noisy_frame(seed: int, shift_m: float = 0.0, posed_shift_m: float | None = N
     said_m = shift_m if posed_shift_m is None else posed_shift_m
     root = (pose.root_position - said_m * forward).astype(np.float32)
     view = View(camera, 0, 0, moved, np.full((*depth.shape, 3), 128, np.uint8))
-    return PosedViews(seed, (view,), forward_kinematics(skeleton, replace(pose, root_position=root)))
+    return PosedViews(-seed, (view,), forward_kinematics(skeleton, replace(pose, root_position=root)))
 
 
 def inside() -> NDArray[np.bool_]:
@@ -87,6 +89,52 @@ def test_what_all_frames_lack_stays_away():
     assert not np.any(true & ~seen)  # nothing is lost, and what is added is a pixel wide and rare
     assert not np.any(seen & (cv2.dilate(true.astype(np.uint8), np.ones((3, 3), np.uint8)) == 0))
     assert np.count_nonzero(seen & ~true) < 0.01 * np.count_nonzero(true)
+
+
+def test_a_step_in_depth_does_not_grow():
+    """What spans a step counts as surface up to 6 cm: one of 4.5 cm must not become a bridge by being sharpened."""
+    true = clean_depth()
+    half = true.shape[1] // 2
+    true[:, half:][true[:, half:] > 0] += STEP_MM
+    view = noisy_frame(0).views[0]
+
+    def stepped(seed: int) -> PosedViews:
+        return replace(noisy_frame(seed), views=(replace(view, depth_mm=true),))
+
+    depth = fused(stepped(0), [stepped(seed) for seed in range(1, 5)]).astype(int)
+    about = slice(half - 5, half + 5)
+    rows = inside()[:, about].all(axis=1)
+    assert rows.sum() > 10
+    grown_mm = np.ptp(depth[rows, about], axis=1) - np.ptp(true[rows, about].astype(int), axis=1)
+    assert grown_mm.mean() < 0.2 * STEP_MM  # unlimited twicing: 0.33
+
+
+def test_a_limb_keeps_its_roundness():
+    """The mesher's means flatten it: of depth that was fused they make the true surface again."""
+    camera = mannequin_camera()
+    columns = np.arange(camera.width) - camera.width / 2
+    radius_px = 12
+    height = np.sqrt(np.maximum(radius_px**2 - columns**2, 0)) * 5000 / camera.fx
+    row = np.where(np.abs(columns) < radius_px - 1, np.rint(5000 - height), 0)
+    depth = np.tile(row, (camera.height, 1)).astype(np.uint16)
+    now = noisy_frame(0)
+    frames = [replace(noisy_frame(s), views=(replace(now.views[0], depth_mm=depth),)) for s in range(5)]
+    within = np.abs(columns) < radius_px - 3
+    errors = [
+        np.abs(smooth_depth(d, SMOOTHING_RADIUS_PIXELS, SMOOTHING_RANGE_MM)[40:-40, within] - (5000 - height)[within])
+        for d in (depth, fused(frames[0], frames[1:]))
+    ]
+    assert errors[1].mean() < 0.8 * errors[0].mean()
+
+
+def test_frames_that_came_later_are_not_used():
+    now, later = noisy_frame(4), [noisy_frame(seed) for seed in range(4)]
+    assert np.array_equal(fused(now, later), now.views[0].depth_mm)
+    before = [noisy_frame(seed) for seed in range(5, 9)]
+    fusion = DepthFusion(8)
+    for frame in [*later, *before]:
+        fusion.remember(frame)
+    assert np.array_equal(fusion.fused(now, mannequin()[0])[0].depth_mm, fused(now, before, most=8))
 
 
 def test_a_frame_alone_is_unchanged():

@@ -1,4 +1,4 @@
-"""A camera's depth of one instant, averaged with its frames before and after: the body has moved, but link by link.
+"""A camera's depth of one instant, averaged with its frames before: the body has moved, but link by link.
 
 A sensor's noise is new in every frame, while a link carries its surface along rigidly. Each pixel of a view is followed
 to the other frames by its link's motion, and the readings found there are averaged. The skeletons know that motion only
@@ -34,6 +34,7 @@ NOISE_MM, SHIFT_MM, TURN_RAD = 14.0, 10.0, 0.08
 SEEN_IN = 0.7  # of the other frames a pixel must have a reading that is missing in the frame itself
 _PRIOR = np.diag(NOISE_MM**2 / np.array([TURN_RAD] * 3 + [SHIFT_MM] * 3) ** 2)
 GATE_PER_MM2 = 5e-6  # readings averaged lie within so much · depth² of the surface: a sensor's noise grows so
+ROUNDNESS_PER_MM2 = 1e-6  # means take at most so much · depth² off a limb: its curvature times a pixel's size squared
 
 Floats = NDArray[np.floating]
 
@@ -48,7 +49,7 @@ class PosedViews:
 
 
 class DepthFusion:
-    """Fuses a frame's depth with that of ``frames`` others, the last ones it was told to remember; 0: with none.
+    """Fuses a frame's depth with that of ``frames`` before it, the last ones it was told to remember; 0: with none.
 
     One thread's own.
     """
@@ -62,12 +63,19 @@ class DepthFusion:
         """A frame to average others with; the oldest one is forgotten."""
         self._frames.append(frame)
 
+    def copy(self) -> DepthFusion:
+        """Another with the same frames, which may go on differently."""
+        other = DepthFusion(self._most)
+        other._frames.extend(self._frames)
+        other._rays = self._rays
+        return other
+
     def fused(self, frame: PosedViews, skeleton: Skeleton) -> tuple[View, ...]:
-        """The views of ``frame``, which are unchanged where no other frame is remembered.
+        """The views of ``frame``, which are unchanged where no earlier frame is remembered.
 
         Their depth has less noise, and readings at the outline and in holes that only this frame lacks.
         """
-        others = [other for other in self._frames if other.capture_ns != frame.capture_ns][-self._most :]
+        others = [other for other in self._frames if other.capture_ns < frame.capture_ns][-self._most :]
         return tuple(self._fused(view, frame, others, skeleton) for view in frame.views)
 
     def _fused(self, view: View, frame: PosedViews, others: Sequence[PosedViews], skeleton: Skeleton) -> View:
@@ -108,10 +116,10 @@ class DepthFusion:
 
 def _sharpened(depth_mm: NDArray[np.uint16]) -> NDArray[np.uint16]:
     """Depth with twice what the mesher's means will take away, a limb's roundness as well as noise; with less noise
-    the roundness counts for more. Their sum is Tukey's twicing."""
+    the roundness counts for more. Their sum is Tukey's twicing. At a step in depth the means take more than roundness
+    can: there it fades, or the step would grow, and what spans it would count as a bridge over an occlusion."""
     means = smooth_depth(depth_mm, SMOOTHING_RADIUS_PIXELS, SMOOTHING_RANGE_MM)
-    sharpened = np.clip(np.rint(2 * depth_mm.astype(np.float32) - means), 1, 65535)
-    return np.where(depth_mm > 0, sharpened, 0).astype(np.uint16)
+    return _twiced(depth_mm, means, np.float32(ROUNDNESS_PER_MM2))
 
 
 def _same(a: Camera, b: Camera) -> bool:
@@ -282,3 +290,20 @@ def _gather(surface, rays, links, then, motion, focal, shift, total, count):  # 
             if abs(r) <= np.float32(GATE_PER_MM2) * z * z:
                 total[y, x] += r
                 count[y, x] += 1
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _twiced(depth_mm, means, per_mm2):  # type: ignore[no-untyped-def]
+    """Each reading and its difference to the mean, of which so much · depth² counts, and less beyond: nothing of three
+    times as much (Hampel's three-part weight)."""
+    out = np.zeros(depth_mm.shape, np.uint16)
+    for y in range(out.shape[0]):
+        for x in range(out.shape[1]):
+            z = np.float32(depth_mm[y, x])
+            if z > 0:
+                limit = per_mm2 * z * z
+                change = z - means[y, x]
+                fading = min(max((3 * limit - abs(change)) / (2 * limit), np.float32(0)), np.float32(1))
+                change = min(max(change, -limit), limit) * fading
+                out[y, x] = min(max(np.rint(z + change), np.float32(1)), np.float32(65535))
+    return out
