@@ -69,25 +69,36 @@ def _rays(camera: Camera, pixels: NDArray[np.float32]) -> NDArray[np.float32]:
 
 @njit(nogil=True, cache=True, error_model="numpy")
 def _smooth(depth_mm, radius, range_mm):  # type: ignore[no-untyped-def]
+    """Row by row and pair by pair: the innermost loop, over the columns, is one the compiler can vectorise."""
     h, w = depth_mm.shape
+    depth = depth_mm.astype(np.float32)
     out = np.zeros((h, w), np.float32)
+    count = np.empty(w, np.float32)
     for y in range(h):
-        rows = min(radius, y, h - 1 - y)
+        centre, total = depth[y], out[y]
+        total[:] = centre
+        count[:] = np.float32(1.0)
+        for j in range(min(radius, y, h - 1 - y) + 1):
+            above, below = depth[y - j], depth[y + j]
+            for i in range(-radius if j > 0 else 1, radius + 1):
+                m = abs(i)
+                _add_pairs(
+                    centre[m : w - m], above[m - i : w - m - i], below[m + i : w - m + i], range_mm,
+                    total[m : w - m], count[m : w - m],
+                )  # fmt: skip
         for x in range(w):
-            centre = np.float32(depth_mm[y, x])
-            if centre == 0:
-                continue
-            columns = min(radius, x, w - 1 - x)
-            total, count = centre, np.float32(1.0)
-            for j in range(rows + 1):
-                for i in range(-columns if j > 0 else 1, columns + 1):
-                    a, b = np.float32(depth_mm[y - j, x - i]), np.float32(depth_mm[y + j, x + i])
-                    # the background, 0, is never near
-                    if max(abs(a - centre), abs(b - centre), abs(a + b - 2 * centre)) <= range_mm:
-                        total += a + b
-                        count += np.float32(2.0)
-            out[y, x] = total / count
+            total[x] = total[x] / count[x] if centre[x] > 0 else np.float32(0.0)
     return out
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _add_pairs(centre, above, below, range_mm, total, count):  # type: ignore[no-untyped-def]
+    """A row's pairs of one direction, each added to the pixel between if it is near; the background, 0, never is."""
+    for x in range(len(centre)):
+        z, a, b = centre[x], above[x], below[x]
+        near = (abs(a - z) <= range_mm) & (abs(b - z) <= range_mm) & (abs(a + b - 2 * z) <= range_mm)
+        total[x] += a + b if near else np.float32(0.0)
+        count[x] += np.float32(2.0) if near else np.float32(0.0)
 
 
 @njit(nogil=True, cache=True, error_model="numpy")

@@ -74,7 +74,7 @@ def _plant(
     across *= (skeleton.radii / np.maximum(np.linalg.norm(across, axis=1), 1e-9))[:, None]
     counts = 2 + (np.linalg.norm(bones, axis=1) / SEED_STEP_M).astype(int)
     of = np.repeat(np.arange(len(starts)), counts)
-    share = np.concatenate([np.linspace(0, 1, count) for count in counts])[:, None]
+    share = ((np.arange(len(of)) - np.repeat(np.cumsum(counts) - counts, counts)) / (counts - 1)[of])[:, None]
     middle, aside = starts[of] + share * bones[of], across[of]
     pixels, depth = project(view.camera, np.concatenate([middle + beside * aside for beside in SEEDS_BESIDE]))
     of = np.tile(of, len(SEEDS_BESIDE))

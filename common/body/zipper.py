@@ -235,7 +235,7 @@ def _redundant(vertices, view_of, images, eyes, normals, quality, outline, limit
         for j in range(len(grids)):
             if j == view_of[v] or depths[j, v] <= 0:
                 continue
-            n = _vertex_at(at, grids[j], pixels[j, v, 0], pixels[j, v, 1], stride, 0, 0)
+            n = _vertex_at(at, grids, j, pixels[j, v, 0], pixels[j, v, 1], stride, 0, 0)
             apart = _outline_apart(v, j, vertices, normals, eyes, images, outline, same_m, far_m)
             if apart != 0:
                 total += OUTLINE_WEIGHT
@@ -276,7 +276,7 @@ def _outline_apart(v, j, vertices, normals, eyes, images, outline, same_m, far_m
     nearest = far_m * far_m
     for down in range(-1, 2):
         for right in range(-1, 2):
-            n = _vertex_at(at, grids[j], pixels[j, v, 0], pixels[j, v, 1], stride, down, right)
+            n = _vertex_at(at, grids, j, pixels[j, v, 0], pixels[j, v, 1], stride, down, right)
             if n < 0 or not outline[n]:
                 continue
             distance, off = np.float32(0.0), np.float32(0.0)
@@ -290,13 +290,13 @@ def _outline_apart(v, j, vertices, normals, eyes, images, outline, same_m, far_m
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
-def _vertex_at(at, grid, x, y, stride, down, right):  # type: ignore[no-untyped-def]
-    """The vertex in the square of pixel (x, y), or so many squares ``down`` and ``right`` of it; -1 if none."""
+def _vertex_at(at, grids, j, x, y, stride, down, right):  # type: ignore[no-untyped-def]
+    """The vertex in the square of view j's pixel (x, y), or so many ``down`` and ``right`` of it; -1 if none."""
     r = np.int64(np.floor((y + np.float32(0.5)) / stride)) + down
     c = np.int64(np.floor((x + np.float32(0.5)) / stride)) + right
-    if r < 0 or c < 0 or r >= grid[1] or c >= grid[2]:
+    if r < 0 or c < 0 or r >= grids[j, 1] or c >= grids[j, 2]:
         return np.int32(-1)
-    return at[grid[0] + r * grid[2] + c]
+    return at[grids[j, 0] + r * grids[j, 2] + c]
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
@@ -338,7 +338,7 @@ def _snapped(vertices, view_of, images, normals, border, squares, reach, same_si
                 continue
             for down in range(-window, window + 1):
                 for right in range(-window, window + 1):
-                    n = _vertex_at(at, grids[j], pixels[j, v, 0], pixels[j, v, 1], stride, down, right)
+                    n = _vertex_at(at, grids, j, pixels[j, v, 0], pixels[j, v, 1], stride, down, right)
                     if n < 0 or not border[n] or leader[n] != n:
                         continue
                     x, y = vertices[n, 0] - vertices[v, 0], vertices[n, 1] - vertices[v, 1]

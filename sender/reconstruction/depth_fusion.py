@@ -90,16 +90,17 @@ class DepthFusion:
         normals, centres = _normals_and_centres(surface, rays, links, LINK_COUNT)
         _extend(surface)
         total, count = _own_readings(surface, view.depth_mm)
+        motion = _motion(camera, frame.T_world_link, np.stack([other.T_world_link for _, other in pairs]))
+        at = np.einsum("nlij,lj->nli", motion[..., :3], centres) + motion[..., 3]
         focal = np.array([camera.fx, camera.fy], np.float32)
-        for then, other in pairs:
-            shift = np.array([view.u0 - then.u0, view.v0 - then.v0], np.float32)
-            motion = _motion(camera, frame.T_world_link, other.T_world_link)
-            at = np.einsum("lij,lj->li", motion[:, :, :3], centres) + motion[:, :, 3]
-            normal_equations = _registration(
-                surface, rays, normals, links, then.depth_mm, motion.astype(np.float32), at, focal, shift
-            )
-            motion = _moved(motion, at, *normal_equations)
-            _gather(surface, rays, links, then.depth_mm, motion.astype(np.float32), focal, shift, total, count)
+        shifts = np.array([(view.u0 - then.u0, view.v0 - then.v0) for then, _ in pairs], np.float32)
+        equations = [
+            _registration(surface, rays, normals, links, then.depth_mm, roughly, centre, focal, shift)
+            for (then, _), roughly, centre, shift in zip(pairs, motion.astype(np.float32), at, shifts, strict=True)
+        ]
+        motion = _moved(motion, at, *(np.stack(parts) for parts in zip(*equations, strict=True)))
+        for (then, _), registered, shift in zip(pairs, motion.astype(np.float32), shifts, strict=True):
+            _gather(surface, rays, links, then.depth_mm, registered, focal, shift, total, count)
         mean = surface + total / np.maximum(count, 1)
         there = (view.depth_mm > 0) | (count >= SEEN_IN * len(pairs))
         depth = np.where(there & (surface > 0), np.clip(np.rint(mean), 1, 65535), 0).astype(np.uint16)
@@ -141,22 +142,21 @@ def _links(
 
 
 def _motion(camera: Camera, now: Floats, then: Floats) -> NDArray[np.float64]:
-    """Each link's motion (L, 3, 4) in the camera's frame [mm], from now to then."""
+    """Each link's motion (N, L, 3, 4) in the camera's frame [mm], from ``now`` (L, 4, 4) to ``then`` (N, L, 4, 4)."""
     T = camera.T_world_camera
-    motion = inverse(T) @ then.astype(np.float64) @ inverse(now.astype(np.float64)) @ T
-    motion[:, :3, 3] *= 1e3
-    return np.ascontiguousarray(motion[:, :3])
+    motion = inverse(T) @ then.astype(np.float64) @ (inverse(now.astype(np.float64)) @ T)
+    motion[..., :3, 3] *= 1e3
+    return np.ascontiguousarray(motion[..., :3, :])
 
 
 def _moved(motion: Floats, at: Floats, H: Floats, g: Floats) -> NDArray[np.float64]:
-    """The motions (L, 3, 4) after one Gauss–Newton step, which turns each link about its centre ``at`` (L, 3)."""
-    step = np.linalg.solve(H + _PRIOR, g[:, :, None])[:, :, 0]
-    half = step[:, :3] / 2
-    turns = np.concatenate([np.ones((len(step), 1)), half], axis=1)
-    R = quaternion.to_matrix(turns / np.linalg.norm(turns, axis=1, keepdims=True))
+    """The motions (N, L, 3, 4) after one Gauss–Newton step, which turns each link about its centre ``at`` (N, L, 3)."""
+    step = np.linalg.solve(H + _PRIOR, g[..., None])[..., 0]
+    turns = np.concatenate([np.ones((*step.shape[:-1], 1)), step[..., :3] / 2], axis=-1)
+    R = quaternion.to_matrix(turns / np.linalg.norm(turns, axis=-1, keepdims=True))
     out = np.empty_like(motion, np.float64)
-    out[:, :, :3] = R @ motion[:, :, :3]
-    out[:, :, 3] = np.einsum("lij,lj->li", R, motion[:, :, 3] - at) + at + step[:, 3:]
+    out[..., :3] = R @ motion[..., :3]
+    out[..., 3] = np.einsum("nlij,nlj->nli", R, motion[..., 3] - at) + at + step[..., 3:]
     return out
 
 
