@@ -67,7 +67,7 @@ class TrackingSettings:
 @dataclass(frozen=True, slots=True)
 class CandidateSettings:
     """Candidate poses. ``choice``: what is sent next, by "coverage" or by the "paper"'s χ. ``interval_ms``: time
-    between two that are considered; ``busy_share``: at most this share of the time is spent on making them.
+    between two that are considered; ``busy_share``: at most this share of a core is spent on making them.
     ``least_confidence``: of a fit, for its frame to become one. ``jpeg_quality``, ``depth_step_mm``: how finely a view
     is sent; the ``thin_`` ones where a pose would take long. ``send_log``: a file that gets a JSON line for every send.
     ``fused_frames``: so many frames are averaged into a pose's depth. ``segmentation``: what belongs to which link.
