@@ -222,9 +222,9 @@ def _fill_background(colour: NDArray[np.uint8], depth: NDArray[np.uint16], out: 
                 for u in range(left, right):
                     if depth[v, u]:
                         count += 1
-                        red += colour[v, u, 0]
-                        green += colour[v, u, 1]
-                        blue += colour[v, u, 2]
+                        red += int(colour[v, u, 0])
+                        green += int(colour[v, u, 1])
+                        blue += int(colour[v, u, 2])
             if count:
                 mean[0], mean[1], mean[2] = red // count, green // count, blue // count
             for v in range(top, bottom):
