@@ -216,14 +216,14 @@ def test_memory_is_bounded_and_the_worst_go_first() -> None:
 
 # Poses 0 and 1 look alike and are good for three of four skeletons; pose 2 for the fourth only; pose 3 for none.
 SIGMAS = np.array([[0.1, 0.1, 0.1, 2.0], [0.1, 0.1, 0.2, 2.0], [2.0, 2.0, 2.0, 0.1], [3.0, 3.0, 3.0, 3.0]], np.float32)
-COVERAGE = Coverage((0, 1, 2, 3), SIGMAS, np.full(4, 0.25, np.float32))
+COVERAGE = Coverage((0, 1, 2, 3), SIGMAS)
 
 
 def by_coverage(*holding: int, ids: tuple[int, ...] = (0, 1, 2, 3)) -> MeshScheduler:
     scheduler = MeshScheduler()
     rows = [COVERAGE.pose_ids.index(pose_id) for pose_id in ids]
     for pose_id in ids:
-        coverage = Coverage(ids, COVERAGE.sigmas[rows], COVERAGE.weights)
+        coverage = Coverage(ids, COVERAGE.sigmas[rows])
         scheduler.offer(pose_id, payload(pose_id), pose_id * SECOND, coverage)
     scheduler.receiver_joined("r", 1, holding)
     return scheduler
@@ -261,7 +261,7 @@ def test_with_ample_bandwidth_the_newest_goes_first_whatever_it_adds() -> None:
 
 def test_what_left_the_coverage_unsent_is_forgotten() -> None:
     scheduler = by_coverage(0)
-    kept = Coverage((0, 4), SIGMAS[[0, 2]], COVERAGE.weights)
+    kept = Coverage((0, 4), SIGMAS[[0, 2]])
     scheduler.offer(4, payload(4), 4 * SECOND, kept)
     assert scheduler.held_bytes == 2 * POSE_BYTES
     record = send(scheduler)
@@ -280,7 +280,7 @@ def test_bounds_hold_whatever_happens(events: list[tuple[str, int, float]]) -> N
             scheduler.offer(number, b"p" * (1 + number * 100), now, Quotients({number: chi}, frozenset([number])), b"s")
         elif event == "c":
             sigmas = np.full((1, 3), chi, np.float32)
-            scheduler.offer(number, b"p" * 500, now, Coverage((number,), sigmas, np.full(3, 1 / 3, np.float32)))
+            scheduler.offer(number, b"p" * 500, now, Coverage((number,), sigmas))
         elif event == "s":
             chosen = scheduler.next_for(receiver, int(chi * AMPLE), now)
             if chosen is not None:

@@ -32,12 +32,11 @@ def test_sigma_of_every_pose_for_every_skeleton_whichever_came_first() -> None:
     expected = [[distortion_score(captured(a), target, weights) for target in targets] for a in (0.5, 1.1)]
     assert coverage.pose_ids == (1, 2)
     np.testing.assert_allclose(coverage.sigmas, expected, rtol=1e-3)
-    np.testing.assert_allclose(coverage.weights, 1 / 3)
 
 
 def test_gain_is_what_the_mean_best_score_falls_by() -> None:
     sigmas = np.array([[0.2, 1.0], [0.1, 2.0], [3.0, 0.4]], np.float32)
-    coverage = Coverage((5, 6, 7), sigmas, np.array([0.5, 0.5], np.float32))
+    coverage = Coverage((5, 6, 7), sigmas)
     assert coverage.gains([5, 6, 7, 99], [5]) == pytest.approx([0, 0.05, 0.3, 0])
     assert coverage.gains([5], []) == pytest.approx([SIGMA_MAX - 0.6])
     assert coverage.gains([7], [5, 6, 42]) == pytest.approx([0.3])
@@ -51,12 +50,6 @@ def test_skeletons_are_thinned_and_the_oldest_give_way() -> None:
     sigmas = poses.worth().sigmas
     assert sigmas.shape == (1, 3)
     assert sigmas.max() < 0.2  # those kept are the last ones, near 0.9 rad
-
-
-def test_what_came_lately_can_weigh_more() -> None:
-    settings = CoverageSettings(recent_ns=2 * TENTH, recent_weight=3.0)
-    weights = session(0.1, 0.2, 0.3, 0.4, settings=settings).worth().weights
-    np.testing.assert_allclose(weights, np.array([1, 1, 3, 3]) / 8)
 
 
 def test_the_pose_least_needed_leaves_but_neither_the_newest_nor_a_sent_one() -> None:

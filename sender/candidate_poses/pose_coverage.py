@@ -26,31 +26,26 @@ SIGMA_MAX = 3.0  # DISPOSE §7.1.1: beyond it a mesh is unrecognisable, however 
 @dataclass(frozen=True, slots=True)
 class CoverageSettings:
     """``max_poses``, ``max_skeletons`` bound what is kept; ``skeleton_every_ns``: of the skeletons sent, one in such a
-    time is buffered (30 s then). ``recent_ns, recent_weight``: what the person did so lately counts so many times,
-    for it is what comes next."""
+    time is buffered (30 s then)."""
 
     max_poses: int = 200
     max_skeletons: int = 300
     skeleton_every_ns: int = 100_000_000
-    recent_ns: int = 2_000_000_000
-    recent_weight: float = 1.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Coverage:
-    """σ of the poses ``pose_ids`` (P) for the buffered skeletons, ``sigmas`` (P, S) float32 in [0, SIGMA_MAX];
-    ``weights`` (S,) float32, their sum is 1."""
+    """σ of the poses ``pose_ids`` (P) for the buffered skeletons, ``sigmas`` (P, S) float32 in [0, SIGMA_MAX]."""
 
     pose_ids: tuple[int, ...]
     sigmas: NDArray[np.float32]
-    weights: NDArray[np.float32]
 
     def gains(self, pose_ids: Sequence[int], has: Collection[int]) -> NDArray[np.float32]:
         """By how much each of ``pose_ids`` would lower the mean best σ, (n,) float32 >= 0, of a receiver that ``has``
         some; 0 for unknown poses."""
         row = {pose_id: index for index, pose_id in enumerate(self.pose_ids)}
         best = self.best([row[pose_id] for pose_id in has if pose_id in row])
-        saved = np.maximum(best - self.sigmas, 0) @ self.weights
+        saved = np.maximum(best - self.sigmas, 0).sum(axis=1) / max(self.sigmas.shape[1], 1)
         return np.array([saved[row[p]] if p in row else 0.0 for p in pose_ids], np.float32)
 
     def best(self, rows: Sequence[int]) -> NDArray[np.float32]:
@@ -112,12 +107,8 @@ class CoverageSet:
     def worth(self) -> Coverage:
         """σ as it is now, a copy, for who sends them."""
         slots = np.flatnonzero(self._times_ns >= 0)
-        times_ns = self._times_ns[slots]
-        weights = np.ones(len(slots), np.float32)
-        if len(slots):
-            weights[times_ns > times_ns.max() - self._settings.recent_ns] = self._settings.recent_weight
         rows = np.array(list(self._rows.values()), np.int64)
-        return Coverage(tuple(self._rows), self._sigmas[np.ix_(rows, slots)], weights / max(weights.sum(), 1))
+        return Coverage(tuple(self._rows), self._sigmas[np.ix_(rows, slots)])
 
     def _least_needed(self, newest: int) -> int:
         """The pose without which the mean best σ rises least; the older of equals."""
@@ -125,7 +116,7 @@ class CoverageSet:
         ids = coverage.pose_ids
         lowest = np.partition(coverage.sigmas, 1, axis=0)[:2] if len(ids) > 1 else np.zeros((2, 1), np.float32)
         alone = coverage.sigmas <= lowest[0]
-        needed = np.where(alone, lowest[1] - lowest[0], 0) @ coverage.weights
+        needed = np.where(alone, lowest[1] - lowest[0], 0).sum(axis=1)
         spare = [i for i in range(len(ids)) if ids[i] != newest and ids[i] not in self._sent]
         spare = spare or [i for i in range(len(ids)) if ids[i] != newest]
         return ids[min(spare, key=lambda i: (needed[i], self._captured_ns[ids[i]]))]
