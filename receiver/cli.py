@@ -20,6 +20,7 @@ EXPORT_SUFFIXES = (".glb", ".ply")
 EXAMPLES = """examples:
   telepose-receive                                    the sender on this host; the page is http://127.0.0.1:8080/
   telepose-receive -e tcp/192.0.2.7:7447              the sender on another host
+  telepose-receive --certificates DIR -e studio.example:7447     secured: docs/deploy.md
   telepose-receive --window                           a desktop window besides the page
   telepose-receive --headless --log-shown shown.log   no page: render offscreen and keep what was shown
   telepose-receive export person.glb person.ply       the person whom a running receiver shows now, as files

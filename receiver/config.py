@@ -9,7 +9,7 @@ from typing import Literal
 from common.body.body_regions import DEFAULT_WEIGHTS, region_weights
 from common.body.joint_edges import ScoreForm
 from common.runtime.metrics import MetricsSettings
-from common.transport.zenoh_session import LinkSettings
+from common.transport.link_settings import LinkSettings
 
 
 @dataclass(frozen=True, slots=True)

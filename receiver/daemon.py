@@ -24,7 +24,9 @@ from common.runtime.metrics import Health, Metrics, daemon_app, serve_app
 from common.runtime.run_statistics import RunStatistics, write_statistics
 from common.runtime.stage_timer import StageTimer
 from common.runtime.threads import into_background
-from common.transport.zenoh_session import ZenohSession, open_session, with_endpoints
+from common.transport.access_rules import for_receiver, receiver_name
+from common.transport.link_settings import with_endpoints
+from common.transport.zenoh_session import ZenohSession, open_session, own_certificate
 from common.wire.header import WireError
 from common.wire.skeleton_packet import SkeletonPacket
 from receiver.channels_in import Handlers, ReceiverChannels
@@ -62,8 +64,13 @@ class ReceiverDaemon:
             DaemonError: a port or file that cannot be used; the message says which.
         """
         settings = self._settings
-        async with open_session(with_endpoints(settings.link, "receiver")) as session:
-            show = _Show(settings, session, self._clock, self._health)
+        link = with_endpoints(settings.link, "receiver")
+        certificate = own_certificate(link)
+        name = settings.name or secrets.token_hex(4)
+        if certificate is not None:
+            name = receiver_name(certificate.name, name)
+        async with open_session(link, for_receiver(settings.site, name, link.mode == "client")) as session:
+            show = _Show(settings, name, session, self._clock, self._health)
             app = daemon_app(show.metrics, self._health)
             if isinstance(show.viewer, WebViewer):
                 show.viewer.add_routes(app)
@@ -84,7 +91,7 @@ class _Show:
     """One run with one open session."""
 
     def __init__(
-        self, settings: ReceiverSettings, session: ZenohSession, clock: MonotonicClock, health: Health
+        self, settings: ReceiverSettings, name: str, session: ZenohSession, clock: MonotonicClock, health: Health
     ) -> None:
         self._settings = settings
         self._clock = clock
@@ -92,7 +99,6 @@ class _Show:
         self._timer = StageTimer(clock)
         self._statistics = RunStatistics(self._timer)
         self._counts: Counter[str] = Counter()
-        name = settings.name or secrets.token_hex(4)
         self._channels = ReceiverChannels(
             session, settings.site, settings.person, name, secrets.randbits(64), secrets.randbits(32), clock
         )
@@ -110,6 +116,7 @@ class _Show:
             else WebViewer(allowed_hosts=settings.view.allowed_hosts, skinning=settings.view.skinning)
         )
         self.metrics = self._make_metrics()
+        session.add_metrics(self.metrics)
 
     async def run(self, daemon: Daemon, page: str) -> None:
         """Receive and show until cancelled, or until the window on ``page`` is closed where there is one."""

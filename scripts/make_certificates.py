@@ -23,7 +23,7 @@ from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 CA_DAYS, SITE_DAYS = 3650, 397
 _EARLIER = datetime.timedelta(hours=1)  # valid from then on: the sites' clocks need not agree to the second
-_SITE = re.compile(r"[a-z0-9](?:[a-z0-9-]{0,61}[a-z0-9])?")
+_SITE = re.compile(r"[a-z0-9](?:[a-z0-9-]{0,38}[a-z0-9])?")
 _HOST = re.compile(r"(?=.{1,253}$)[a-z0-9](?:[a-z0-9-]*[a-z0-9])?(?:\.[a-z0-9](?:[a-z0-9-]*[a-z0-9])?)*")
 
 DESCRIPTION = """Makes FOLDER/ca.pem and FOLDER/ca.key, a certificate authority, unless they are there, and for each
@@ -53,7 +53,7 @@ class Authority:
     key: ec.EllipticCurvePrivateKey
 
 
-def new_authority(only: Sequence[str] = (), days: int = CA_DAYS, now: datetime.datetime | None = None) -> Authority:
+def new_authority(only: Sequence[str] = (), days: float = CA_DAYS, now: datetime.datetime | None = None) -> Authority:
     """An authority of its own. ``only``: domains and networks beside which its certificates count for nothing
     (name constraints, RFC 5280 §4.2.1.10); none: it is not bound.
 
@@ -77,7 +77,7 @@ def new_certificate(
     authority: Authority,
     site: str,
     addresses: Sequence[str] = (),
-    days: int = SITE_DAYS,
+    days: float = SITE_DAYS,
     now: datetime.datetime | None = None,
 ) -> tuple[x509.Certificate, ec.EllipticCurvePrivateKey]:
     """A certificate for both ends of a link, with its key. ``addresses``: host names and IP addresses.
@@ -86,7 +86,7 @@ def new_certificate(
         MakeCertificatesError: a name or address that cannot be one.
     """
     if _SITE.fullmatch(site) is None:
-        raise MakeCertificatesError(f"site {site!r}: use a-z, 0-9 and - (not first or last), at most 63")
+        raise MakeCertificatesError(f"site {site!r}: use a-z, 0-9 and - (not first or last), at most 40")
     key = ec.generate_private_key(ec.SECP256R1())
     name = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, site)])
     usage = x509.KeyUsage(True, False, False, False, False, False, False, False, False)  # signs handshakes
@@ -167,7 +167,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("sites", nargs="+", metavar="SITE[=ADDRESS,...]", help="a site, and what it is dialled under")
     parser.add_argument("--only", type=lambda text: text.split(","), default=[], metavar="DOMAIN|NETWORK,...",
                         help="bind a new authority to addresses below these domains and in these networks")  # fmt: skip
-    parser.add_argument("--days", type=int, default=SITE_DAYS, help="how long they are valid (default: %(default)s)")
+    parser.add_argument("--days", type=float, default=SITE_DAYS, help="how long they are valid (default: %(default)s)")
     options = parser.parse_args(arguments)
     try:
         for site, folder in make(
@@ -181,7 +181,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def make(
-    folder: Path, sites: Sequence[tuple[str, Sequence[str]]], only: Sequence[str] = (), days: int = SITE_DAYS
+    folder: Path, sites: Sequence[tuple[str, Sequence[str]]], only: Sequence[str] = (), days: float = SITE_DAYS
 ) -> list[tuple[str, Path]]:
     """Folders of all ``sites``, or of none when one cannot be made.
 
@@ -192,7 +192,7 @@ def make(
         if (folder / site).exists():
             raise MakeCertificatesError(f"{folder / site} exists: nothing in it is overwritten, move it away first")
     if not 1 <= days <= CA_DAYS:
-        raise MakeCertificatesError(f"--days {days} is outside 1..{CA_DAYS}")
+        raise MakeCertificatesError(f"--days {days:g} is outside 1..{CA_DAYS}")
     authority = open_authority(folder, only)
     made = [(site, *new_certificate(authority, site, addresses, days)) for site, addresses in sites]
     for site, certificate, key in made:
@@ -205,7 +205,7 @@ def _now() -> datetime.datetime:
 
 
 def _builder(
-    subject: x509.Name, issuer: x509.Name, key: ec.EllipticCurvePrivateKey, days: int, now: datetime.datetime
+    subject: x509.Name, issuer: x509.Name, key: ec.EllipticCurvePrivateKey, days: float, now: datetime.datetime
 ) -> x509.CertificateBuilder:
     return (
         x509.CertificateBuilder()

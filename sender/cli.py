@@ -15,6 +15,7 @@ from sender.config import SenderSettings
 EXAMPLES = """examples:
   telepose-send                                       the built-in performer before four virtual cameras
   telepose-send -l tcp/0.0.0.0:7447                   the same, for receivers on other hosts
+  telepose-send --certificates DIR -l 0.0.0.0:7447 --receiver lobby       secured: docs/deploy.md
   telepose-send --self-view                           and a page of one's own: http://127.0.0.1:8081/
   telepose-send --recording DIR                       a recording (its format: docs/recordings.md)
   telepose-send --data DIR --body NAME --motion ID    a body and a motion clip of your own
@@ -55,6 +56,9 @@ def parse_arguments(arguments: list[str] | None = None) -> argparse.Namespace:
     )
     parser.add_argument(
         "--tracker", dest="tracking.tracker", metavar="NAME", help="gauss-newton (default), articp or particles"
+    )
+    parser.add_argument(
+        "--receiver", dest="receivers", action="append", metavar="SITE", help="with --certificates: who may receive"
     )
     add_daemon_options(parser)
     return parser.parse_args(arguments)

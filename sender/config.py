@@ -10,7 +10,8 @@ from common.body.body_regions import DEFAULT_WEIGHTS, region_weights
 from common.body.joint_edges import ScoreForm
 from common.body.rigging import Segmentation, Views
 from common.runtime.metrics import MetricsSettings
-from common.transport.zenoh_session import LinkSettings
+from common.transport.channels import check_name
+from common.transport.link_settings import LinkSettings
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,10 +124,13 @@ class SelfViewSettings:
 @dataclass(frozen=True, slots=True)
 class SenderSettings:
     """``site`` and ``person`` name the stream. ``state_folder`` keeps the body found, so that a restarted sender goes
-    on in mid-motion (None: the user's state folder). ``stats_file``: figures written at the end, as JSON."""
+    on in mid-motion (None: the user's state folder). ``stats_file``: figures written at the end, as JSON.
+    ``receivers``: with ``[link] certificates``, the sites whose receivers are served, as their certificates name them.
+    """
 
     site: str = "studio"
     person: int = 0
+    receivers: tuple[str, ...] = ()
     state_folder: Path | None = None
     stats_file: Path | None = None
     link: LinkSettings = field(default_factory=LinkSettings)
@@ -139,6 +143,10 @@ class SenderSettings:
     def __post_init__(self) -> None:
         if not 0 <= self.person <= 255:
             raise ValueError(f"person: {self.person} is outside 0..255")
+        if self.link.certificates and self.link.mode != "client" and not self.receivers:
+            raise ValueError('receivers: name the sites that may receive, as in receivers = ["lobby"]')
+        for name in self.receivers:
+            check_name("receivers", name)
         if self.self_view.enabled and self.link.mode == "client":
             raise ValueError("self_view: needs a link of its own, which [link] mode = 'client' cannot have")
         if self.self_view.enabled and self.link.config_file and not self.link.listen:

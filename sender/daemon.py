@@ -20,7 +20,9 @@ from common.runtime.daemon import Daemon, DaemonError
 from common.runtime.metrics import Health, Metrics, daemon_app, serve_app
 from common.runtime.run_statistics import RunStatistics, write_statistics
 from common.runtime.stage_timer import StageTimer
-from common.transport.zenoh_session import ZenohSession, open_session, with_endpoints
+from common.transport.access_rules import Allowance, for_sender
+from common.transport.link_settings import LinkSettings, with_endpoints
+from common.transport.zenoh_session import ZenohSession, open_session, own_certificate
 from sender.body_store import BodyStore
 from sender.candidate_poses.candidate_pace import CandidatePace
 from sender.candidate_poses.mesh_scheduler import MeshScheduler, SendRecord
@@ -68,9 +70,10 @@ class SenderDaemon:
         store = BodyStore(settings.state_folder, settings.site, settings.person)
         body = store.load()
         link = with_endpoints(settings.link, "sender")
+        self._check_site(link)
         with open_self_view(settings.self_view, settings.site, settings.person, link) as self_view:
             link = link if self_view is None else self_view.with_private_link(link)
-            async with open_session(link) as session:
+            async with open_session(link, self._allowed(self_view)) as session:
                 try:
                     source = await self._open_source(body)
                     try:
@@ -81,6 +84,17 @@ class SenderDaemon:
                     raise DaemonError(str(error)) from error
                 except OpenClUnavailable as error:
                     raise DaemonError(f'[tracking] weights = "opencl": {error}') from error
+
+    def _check_site(self, link: LinkSettings) -> None:
+        certificate, site = own_certificate(link), self._settings.site
+        if certificate is not None and certificate.name != site:
+            raise DaemonError(f"site: {site!r}, but the certificate in [link] certificates is of {certificate.name!r}")
+
+    def _allowed(self, self_view: SelfView | None) -> tuple[Allowance, ...]:
+        """Who may receive, when there are certificates to tell."""
+        settings = self._settings
+        allowed = for_sender(settings.site, settings.receivers, settings.link.mode == "client")
+        return allowed if self_view is None else (*allowed, self_view.allowance(settings.site))
 
     async def _open_source(self, body: BodyModel | None) -> FrameSource:
         """Open the cameras, and rehearse meanwhile: the first frames are worth as much as any.
@@ -167,6 +181,7 @@ class _Stream:
         self._skeleton_bytes_max = 0
         self._candidate_bytes: list[int] = []
         self.metrics = self._make_metrics()
+        session.add_metrics(self.metrics)
 
     def close(self) -> None:
         """Write out what is buffered."""

@@ -21,7 +21,8 @@ from dataclasses import replace
 from pathlib import Path
 
 from common.runtime.daemon import DaemonError
-from common.transport.zenoh_session import LinkSettings
+from common.transport.access_rules import Allowance
+from common.transport.link_settings import LinkSettings
 from sender.config import SelfViewSettings
 
 log = logging.getLogger(__name__)
@@ -48,6 +49,10 @@ class SelfView:
     def with_private_link(self, link: LinkSettings) -> LinkSettings:
         """The sender's link, listening on the private socket too."""
         return replace(link, listen=(*link.listen, self._locator))
+
+    def allowance(self, site: str) -> Allowance:
+        """What the receiver may do: it shows no certificate, but nobody else can open the socket."""
+        return Allowance(site, "receiver", self.name, link="unixsock-stream")
 
     async def run(self) -> None:
         """Keep the receiver running until cancelled.

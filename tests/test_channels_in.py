@@ -15,7 +15,8 @@ from common.transport import channels
 from common.transport.channel_subscriber import Arrival
 from common.transport.channels import channel_key
 from common.transport.chunks import OutgoingMessage
-from common.transport.zenoh_session import LinkSettings, ZenohSession, open_session
+from common.transport.link_settings import LinkSettings
+from common.transport.zenoh_session import ZenohSession, open_session
 from common.wire.body_message import BodyMessage, encode_body
 from common.wire.receiver_report import decode_report
 from common.wire.skeleton_packet import SkeletonPacket, encode_skeleton

@@ -31,16 +31,8 @@ from common.transport.channels import BODY, BULK, CLOCK, RECEIVER_PRESENCE, REPO
 from common.transport.chunks import ChunkAssembler, decode_chunk
 from common.transport.clock_exchange import exchange_times, serve_clock
 from common.transport.clock_offset import ClockOffset
-from common.transport.zenoh_session import (
-    DEFAULT_ENDPOINT,
-    LinkSettings,
-    TransportChange,
-    TransportError,
-    ZenohSession,
-    open_session,
-    with_endpoints,
-    zenoh_config,
-)
+from common.transport.link_settings import DEFAULT_ENDPOINT, LinkSettings, with_endpoints
+from common.transport.zenoh_session import TransportChange, TransportError, ZenohSession, open_session, zenoh_config
 from common.wire.header import WireError
 from common.wire.receiver_report import ReceiverReport, decode_report, encode_report
 
@@ -431,7 +423,8 @@ import asyncio, sys
 from common.runtime.daemon import run_daemon, set_up_logging
 from common.transport.channel_publisher import ChannelPublisher
 from common.transport.channels import *
-from common.transport.zenoh_session import LinkSettings, open_session
+from common.transport.link_settings import LinkSettings
+from common.transport.zenoh_session import open_session
 set_up_logging()
 key = channel_key(SKELETON, "studio", 0)
 async def main(daemon):

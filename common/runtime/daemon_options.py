@@ -20,6 +20,10 @@ def add_daemon_options(parser: argparse.ArgumentParser) -> None:
         "-l", "--listen", dest="link.listen", action="append", metavar="LOCATOR", help="listen, as tcp/0.0.0.0:7447"
     )
     link.add_argument(
+        "--certificates", dest="link.certificates", type=Path, metavar="FOLDER",
+        help="secure every link with this site's certificate (scripts/make_certificates); -e and -l are then HOST:PORT",
+    )  # fmt: skip
+    link.add_argument(
         "--zenoh-config", dest="link.config_file", type=Path, metavar="FILE", help="Zenoh's own JSON5 settings"
     )
     files = parser.add_argument_group("service")

@@ -8,30 +8,29 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import dataclasses
 import json
 import logging
 import re
 import threading
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Callable, Iterable
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any, Literal, TypeVar
+from datetime import UTC, datetime
+from typing import Any, TypeVar
 
 import zenoh
 from zenoh.handlers import Callback
 
 from common.runtime.daemon import DaemonError
-from common.transport.channels import check_name
+from common.runtime.metrics import Metrics
+from common.transport.access_rules import Allowance, access_control
+from common.transport.link_settings import LinkSettings, zenoh_locators
+from common.transport.site_certificate import SiteCertificate, load_site_certificate
 
 log = logging.getLogger(__name__)
 
-DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"  # the sender listens there and the receiver dials it, unless told otherwise
 CLOSE_WITHIN_S = 1.0
-PROTOCOLS = ("tcp", "tls", "quic", "udp", "ws", "unixsock-stream", "serial", "vsock", "unixpipe")
-_NETWORKED = ("tcp", "tls", "quic", "udp", "ws")
-_ADDRESS = re.compile(r"(?P<host>\[[0-9a-fA-F:.%\w]+\]|[^\s:\[\]]+):(?P<port>\d{1,5})")
+WARN_DAYS = 30  # before a certificate expires
 Result = TypeVar("Result")
 
 
@@ -39,71 +38,32 @@ class TransportError(DaemonError):
     """The session cannot be opened; the text says which locator or setting is the cause."""
 
 
-@dataclass(frozen=True, slots=True)
-class LinkSettings:
-    """How a daemon reaches the others.
-
-    ``mode``: None is Zenoh's file's, or peer. ``connect``: locators to dial, again and again until they answer.
-    ``listen``: locators to listen on; none: this daemon cannot be dialled. ``realm``: what separates installations
-    that share a network; it goes in front of every key. ``config_file``: Zenoh's own JSON5 file, for TLS, access
-    control and all else; the settings here are put on top of it. ``lease_ms``: a peer silent that long is gone; longer,
-    and an outage ends in a burst of stale packets. ``retry_ms``: first and longest pause between dialling attempts.
-    """
-
-    mode: Literal["peer", "client"] | None = None
-    connect: tuple[str, ...] = ()
-    listen: tuple[str, ...] = ()
-    realm: str = "telepose"
-    config_file: Path | None = None
-    lease_ms: int = 3000
-    retry_ms: tuple[int, int] = (100, 1000)
-    max_links: int = 2
-    max_message_bytes: int = 1 << 20
-
-    def __post_init__(self) -> None:
-        for key, locators in (("connect", self.connect), ("listen", self.listen)):
-            for locator in locators:
-                check_locator(key, locator)
-        for part in self.realm.split("/"):
-            check_name("realm", part)
-        if not 500 <= self.lease_ms <= 60_000:  # Zenoh takes any number, and 0 for a negative one
-            raise ValueError(f"lease_ms: {self.lease_ms} is outside 500..60000")
-        if not 1 <= self.retry_ms[0] <= self.retry_ms[1] <= 60_000:
-            raise ValueError(f"retry_ms: {list(self.retry_ms)} must rise within 1..60000")
-        if not 1 <= self.max_links <= 8:
-            raise ValueError(f"max_links: {self.max_links} is outside 1..8")
-        if not 64 << 10 <= self.max_message_bytes <= 1 << 30:
-            raise ValueError(f"max_message_bytes: {self.max_message_bytes} is outside 64 KiB..1 GiB")
-        if self.mode == "client" and self.listen:
-            raise ValueError("listen: a client only dials")
-
-
-def check_locator(key: str, locator: str) -> None:
-    """Refuses what Zenoh could not use, with a text an operator understands.
+def own_certificate(settings: LinkSettings) -> SiteCertificate | None:
+    """The certificate that the settings name, None when they name none.
 
     Raises:
-        ValueError: not ``protocol/address``, an unknown protocol, or an address without host or port.
+        CertificateError: it cannot be used now; the text says why.
     """
-    protocol, slash, rest = locator.partition("/")
-    if not slash or protocol not in PROTOCOLS:
-        raise ValueError(f"{key}: {locator!r} is not a locator such as {DEFAULT_ENDPOINT} or tls/host:7448")
-    address = re.split(r"[?#]", rest, maxsplit=1)[0]
-    if protocol not in _NETWORKED:
-        return
-    match = _ADDRESS.fullmatch(address)
-    if match is None or int(match["port"]) > 65535:
-        raise ValueError(f"{key}: {locator!r} needs a host and a port up to 65535, as in {DEFAULT_ENDPOINT}")
+    return load_site_certificate(settings.certificates, datetime.now(UTC)) if settings.certificates else None
 
 
-def zenoh_config(settings: LinkSettings) -> zenoh.Config:
-    """Zenoh's configuration of these settings.
+def zenoh_config(
+    settings: LinkSettings, certificate: SiteCertificate | None = None, allowed: Iterable[Allowance] = ()
+) -> zenoh.Config:
+    """Zenoh's configuration of these settings. ``certificate``: the one they name; with it only what is ``allowed`` is.
 
     Raises:
         TransportError: the file cannot be read, or a value is refused.
+        ValueError: the settings name a certificate, and there is none.
     """
+    if (certificate is None) != (settings.certificates is None):
+        raise ValueError("certificate: not as the settings say")
     try:
         config = zenoh.Config.from_file(settings.config_file) if settings.config_file else zenoh.Config()
-        for key, value in _values(settings, config).items():
+        values = _values(settings, config)
+        if certificate is not None:
+            values |= _secure_values(settings, certificate, allowed)
+        for key, value in values.items():
             config.insert_json5(key, json.dumps(value))
     except (zenoh.ZError, OSError) as error:
         where = f"{settings.config_file}: " if settings.config_file else ""
@@ -134,14 +94,36 @@ def _values(settings: LinkSettings, file: zenoh.Config) -> dict[str, Any]:
     if settings.mode is not None or json.loads(file.get_json("mode")) is None:
         values["mode"] = settings.mode or "peer"
     if settings.connect or not settings.config_file:
-        values["connect/endpoints"] = list(settings.connect)
-    if settings.listen or not isinstance(json.loads(file.get_json("listen/endpoints")), list):
+        values["connect/endpoints"] = _to_dial(settings)
+    listening = [each for locator in settings.listen for each in zenoh_locators(locator)]
+    if listening or not isinstance(json.loads(file.get_json("listen/endpoints")), list):
         # Left to its default, a peer listens on every interface in plain TCP, whatever its TLS settings.
-        values["listen/endpoints"] = list(settings.listen)
+        values["listen/endpoints"] = listening
     locators = settings.connect + settings.listen
     if locators and not settings.config_file:
         values["transport/link/protocols"] = sorted({locator.partition("/")[0] for locator in locators})
     return values
+
+
+def _to_dial(settings: LinkSettings) -> list[Any]:
+    """A client, unlike a peer, would be content with one link of the pair."""
+    pairs = [zenoh_locators(locator) for locator in settings.connect]
+    if settings.mode == "client":
+        return [pair[0] if len(pair) == 1 else {"strategy": "allOf", "locators": pair} for pair in pairs]
+    return [locator for pair in pairs for locator in pair]
+
+
+def _secure_values(
+    settings: LinkSettings, certificate: SiteCertificate, allowed: Iterable[Allowance]
+) -> dict[str, Any]:
+    """TLS and QUIC with certificates at both ends and nothing beside them, and what the other end may do."""
+    local = [each for each in settings.connect + settings.listen if each.startswith("unixsock-stream/")]
+    return {
+        "transport/link/tls": certificate.zenoh_tls(),
+        # A forgotten listener in plain TCP then fails at the start.
+        "transport/link/protocols": ["tls", "quic", *(["unixsock-stream"] if local else [])],
+        "access_control": access_control(settings.realm, allowed),
+    }
 
 
 @dataclass(frozen=True, slots=True)
@@ -155,8 +137,11 @@ class TransportChange:
 class ZenohSession:
     """An open session. Its callbacks run on the loop that opened it."""
 
-    def __init__(self, session: zenoh.Session, loop: asyncio.AbstractEventLoop) -> None:
+    def __init__(
+        self, session: zenoh.Session, loop: asyncio.AbstractEventLoop, certificate: SiteCertificate | None = None
+    ) -> None:
         self.zenoh = session
+        self.certificate = certificate
         self.loop = loop
         self._declared: list[Any] = []
 
@@ -168,6 +153,13 @@ class ZenohSession:
     def keep(self, declared: Any) -> None:
         """Hold on to something declared, so that it lives as long as the session."""
         self._declared.append(declared)
+
+    def add_metrics(self, metrics: Metrics) -> None:
+        """What an operator has to know of the link."""
+        certificate = self.certificate
+        if certificate is not None:
+            about = "Until this site's certificate expires"
+            metrics.gauge("certificate_days_left", about, lambda: certificate.days_left(datetime.now(UTC)))
 
     def watch_transports(self, on_change: Callable[[TransportChange], None]) -> None:
         """Call ``on_change`` for every transport that is open now and for every change from now on."""
@@ -194,13 +186,17 @@ class ZenohSession:
 
 
 @asynccontextmanager
-async def open_session(settings: LinkSettings) -> AsyncIterator[ZenohSession]:
+async def open_session(settings: LinkSettings, allowed: Iterable[Allowance] = ()) -> AsyncIterator[ZenohSession]:
     """A session for as long as the context lasts. Absent peers are no error: they are dialled until they come.
+
+    ``allowed``: what others may do when the settings name certificates; without these nobody can be told apart.
 
     Raises:
         TransportError: a port in use, a bad address or a bad setting; the text names it.
+        CertificateError: the certificate cannot be used.
     """
-    config = zenoh_config(settings)
+    certificate = own_certificate(settings)
+    config = zenoh_config(settings, certificate, allowed)
     loop = asyncio.get_running_loop()
     try:
         session = await _in_thread(lambda: zenoh.open(config), too_late=_close)
@@ -208,8 +204,10 @@ async def open_session(settings: LinkSettings) -> AsyncIterator[ZenohSession]:
         raise TransportError(_explained(str(error), settings)) from error
     listening, dialling = (", ".join(locators) or "none" for locators in (settings.listen, settings.connect))
     log.info("zenoh session %s, listening on: %s, dialling: %s", session.zid(), listening, dialling)
+    if certificate is not None and certificate.days_left(datetime.now(UTC)) < WARN_DAYS:
+        log.warning("%s: expires on %s", certificate.certificate_file, f"{certificate.expires:%Y-%m-%d %H:%M} UTC")
     try:
-        yield ZenohSession(session, loop)
+        yield ZenohSession(session, loop, certificate)
     finally:
         try:
             # Closing tells the peers, which can take long when they do not answer.
@@ -252,15 +250,6 @@ async def _in_thread(call: Callable[[], Result], too_late: Callable[[Result], ob
 
 def _close(session: zenoh.Session) -> None:
     session.close()  # type: ignore[no-untyped-call]
-
-
-def with_endpoints(settings: LinkSettings, role: Literal["sender", "receiver"]) -> LinkSettings:
-    """The settings with the role's default locator when they name none: the sender listens, the receiver dials."""
-    if settings.connect or settings.listen or settings.config_file:
-        return settings
-    if role == "sender":
-        return dataclasses.replace(settings, listen=(DEFAULT_ENDPOINT,))
-    return dataclasses.replace(settings, connect=(DEFAULT_ENDPOINT,))
 
 
 def _explained(error: str, settings: LinkSettings) -> str:

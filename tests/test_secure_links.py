@@ -1,0 +1,408 @@
+"""Links secured by certificates: real Zenoh sessions on loopback, and everyone who should not get in or get through."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+from collections.abc import AsyncIterator, Callable
+from contextlib import AsyncExitStack, asynccontextmanager
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Any
+
+import pytest
+import zenoh
+
+from common.runtime.clock import MonotonicClock
+from common.transport import channels
+from common.transport.access_rules import for_receiver, for_sender, receivers_of
+from common.transport.channel_publisher import ChannelPublisher
+from common.transport.channel_query import ChannelQueryable, ask
+from common.transport.channel_subscriber import Arrival, ChannelSubscriber
+from common.transport.channels import BODY, BULK, REPORT, SKELETON, Channel, channel_key
+from common.transport.link_settings import LinkSettings
+from common.transport.site_certificate import CertificateError, SiteCertificate, load_site_certificate
+from common.transport.zenoh_session import TransportError, ZenohSession, open_session
+from scripts.daemon_processes import free_port
+from scripts.make_certificates import new_authority, new_certificate, write_site
+from scripts.zenoh_router import router_values
+from tests.link_certificates import make_sites, outsider, pair
+from tests.listening_sockets import listening_ports
+
+ROUTER_FILE = Path(__file__).parents[1] / "deploy" / "router.json5"
+CLOCK = MonotonicClock()
+NAME = "lobby.1"
+
+
+@pytest.fixture(scope="module")
+def sites(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return make_sites(tmp_path_factory.mktemp("certificates"))
+
+
+def key(channel: Channel, receiver: str | None = None, site: str = "studio") -> str:
+    return channel_key(channel, site, 0, receiver)
+
+
+async def until(condition: Callable[[], object], limit_s: float = 10.0) -> None:
+    async with asyncio.timeout(limit_s):
+        while not condition():  # noqa: ASYNC110 (what is waited for happens in Zenoh)
+            await asyncio.sleep(0.01)
+
+
+def listening(sites: Path, port: int, **settings: Any) -> LinkSettings:
+    return LinkSettings(certificates=sites / "studio", listen=(f"127.0.0.1:{port}",), **settings)
+
+
+def dialling(sites: Path, port: int, site: str = "lobby", **settings: Any) -> LinkSettings:
+    return LinkSettings(certificates=sites / site, connect=(f"127.0.0.1:{port}",), **settings)
+
+
+class Heard:
+    """A subscriber's payloads."""
+
+    def __init__(self, session: ZenohSession, channel: Channel, expression: str) -> None:
+        self.payloads: list[bytes] = []
+        ChannelSubscriber(session, channel, expression, self._take, CLOCK)
+
+    def _take(self, arrival: Arrival) -> None:
+        self.payloads.append(arrival.payload)
+
+
+class Stream:
+    """A studio and a lobby over the secure pair, and what each heard."""
+
+    def __init__(self, port: int, studio: ZenohSession, lobby: ZenohSession) -> None:
+        self.port, self.studio, self.lobby = port, studio, lobby
+        self.skeleton = ChannelPublisher(studio, SKELETON, key(SKELETON))
+        self.bulk = ChannelPublisher(studio, BULK, key(BULK, NAME))
+        self.report = ChannelPublisher(lobby, REPORT, key(REPORT, NAME))
+        self.skeletons, self.chunks = Heard(lobby, SKELETON, key(SKELETON)), Heard(lobby, BULK, key(BULK, NAME))
+        self.reports = Heard(studio, REPORT, key(REPORT, "*"))
+        ChannelQueryable(studio, BODY, key(BODY), lambda _: b"body")
+
+    async def flows(self) -> bool:
+        """A skeleton and a chunk arrive there, a report here."""
+        before = [len(heard.payloads) for heard in (self.skeletons, self.chunks, self.reports)]
+        await until(lambda: self.skeleton.heard and self.bulk.heard and self.report.heard)
+        async with asyncio.timeout(10):
+            while not all(
+                len(heard.payloads) > count
+                for heard, count in zip((self.skeletons, self.chunks, self.reports), before, strict=True)
+            ):
+                self.skeleton.put(b"skeleton")
+                self.bulk.put(b"c" * 100)
+                self.report.put(b"report")
+                await asyncio.sleep(0.02)
+        return True
+
+
+@asynccontextmanager
+async def stream(sites: Path) -> AsyncIterator[Stream]:
+    port = free_port()
+    async with (
+        open_session(listening(sites, port), for_sender("studio", ["lobby"])) as studio,
+        open_session(dialling(sites, port), for_receiver("studio", NAME)) as lobby,
+    ):
+        made = Stream(port, studio, lobby)
+        assert await made.flows()
+        yield made
+
+
+async def test_one_setting_gives_a_datagram_link_and_a_tls_link_with_names_at_both_ends(sites: Path) -> None:
+    async with stream(sites) as made:
+        await until(lambda: len(made.studio.zenoh.info.links()) == 2)
+        for session, other in ((made.studio, "lobby"), (made.lobby, "studio")):
+            links = {link.dst.partition("/")[0]: link for link in map(_any, session.zenoh.info.links())}
+            assert set(links) == {"quic", "tls"}
+            assert str(links["quic"].reliability) == "Reliability.BEST_EFFORT"
+            assert str(links["tls"].reliability) == "Reliability.RELIABLE"
+            assert {link.auth_identifier for link in links.values()} == {other}
+        assert await ask(made.lobby, BODY, key(BODY)) == [b"body"]
+
+
+def _any(value: Any) -> Any:
+    return value
+
+
+async def test_without_a_valid_certificate_nobody_gets_in(sites: Path) -> None:
+    async with stream(sites) as made:
+        lobby, foreign, expired = (sites / name for name in ("lobby", "foreign", "expired"))
+        secure, plain = pair(made.port), [f"tcp/127.0.0.1:{made.port}"]
+        attempts = {
+            "no certificate": (secure, None, lobby),
+            "another authority's": (secure, foreign, lobby),
+            "another authority's, trusting it": (secure, foreign, foreign),
+            "expired": (secure, expired, lobby),
+            "plaintext": (plain, None, None),
+        }
+        ways_in = [asyncio.to_thread(outsider, *attempt) for attempt in attempts.values()]
+        ends = await asyncio.gather(*ways_in, return_exceptions=True)
+        assert {name for name, end in zip(attempts, ends, strict=True) if not isinstance(end, zenoh.ZError)} == set()
+        assert await made.flows()
+
+
+async def test_a_server_with_another_name_is_not_talked_to(sites: Path) -> None:
+    port = free_port()
+    elsewhere = LinkSettings(certificates=sites / "elsewhere", listen=(f"127.0.0.1:{port}",))
+    async with (
+        open_session(elsewhere, for_sender("elsewhere", ["lobby"])) as server,
+        open_session(dialling(sites, port), for_receiver("elsewhere", NAME)) as lobby,
+    ):
+        await asyncio.sleep(1)
+        assert list(server.zenoh.info.links()) == list(lobby.zenoh.info.links()) == []
+
+
+@pytest.mark.parametrize("site", ["rogue", "wall", "lobby"])
+async def test_a_valid_certificate_opens_no_foreign_keys_in_either_direction(sites: Path, site: str) -> None:
+    """A rogue has no part in the stream, a wall none in the lobby's; a lobby may not speak for the studio."""
+    port, heard = free_port(), list[str]()
+    async with open_session(listening(sites, port), for_sender("studio", ["lobby", "wall"])) as studio:
+        own = Heard(studio, REPORT, key(REPORT, "*"))
+        skeletons = Heard(studio, SKELETON, key(SKELETON))
+        ChannelQueryable(studio, BODY, key(BODY), lambda _: b"body")
+        present = list[str]()
+        studio.watch_presence(key(channels.RECEIVER_PRESENCE, "*"), lambda name, _: present.append(name))
+        attacker = await asyncio.to_thread(outsider, pair(port), sites / site)
+        try:
+            await until(lambda: len(studio.zenoh.info.links()) == 2)
+            victim = "wall.1" if site == "lobby" else NAME
+            foreign = [key(BULK, victim), key(REPORT, "*"), key(SKELETON, site="other"), "**"]
+            mine = ["v1/other/0/skeleton", key(REPORT, victim), key(SKELETON), key(BULK, victim), key(BODY)]
+            kept = [
+                attacker.declare_subscriber(each, lambda sample: heard.append(str(sample.key_expr))) for each in foreign
+            ]
+            kept.append(attacker.liveliness().declare_token(key(channels.RECEIVER_PRESENCE, victim)))  # type: ignore[arg-type]
+            await asyncio.sleep(0.2)
+            for each in mine:
+                attacker.put(each, b"forged", allowed_destination=zenoh.Locality.REMOTE)
+            for each in (key(SKELETON), key(BULK, victim), key(BODY)):
+                studio.zenoh.put(each, b"secret", allowed_destination=zenoh.Locality.REMOTE)
+            answers = await asyncio.to_thread(lambda: list(attacker.get(key(BODY), timeout=0.5)))
+            await asyncio.sleep(0.3)
+        finally:
+            await asyncio.to_thread(_close, attacker)
+    assert heard == []
+    assert (own.payloads, skeletons.payloads, present) == ([], [], [])
+    assert [bool(answer.ok) for answer in answers] == ([] if site == "rogue" else [True])
+
+
+def _close(session: zenoh.Session) -> None:
+    session.close()  # type: ignore[no-untyped-call]
+
+
+def test_a_name_that_only_begins_like_another_is_another() -> None:
+    mine, other = zenoh.KeyExpr(receivers_of("lobby")), zenoh.KeyExpr(receivers_of("lobby-2"))
+    assert mine.includes(zenoh.KeyExpr("lobby.wall"))
+    for name in ("lobby-2.wall", "lobbyx.wall", "lobby"):
+        assert not mine.includes(zenoh.KeyExpr(name))
+    assert not mine.intersects(other)
+
+
+async def test_a_link_ends_with_its_certificate(sites: Path, tmp_path: Path) -> None:
+    authority = new_authority()
+    write_site(tmp_path / "studio", authority, *new_certificate(authority, "studio", ["127.0.0.1"]))
+    lasts = timedelta(seconds=3)
+    write_site(tmp_path / "lobby", authority, *new_certificate(authority, "lobby", days=lasts / timedelta(days=1)))
+    async with stream(tmp_path) as made:
+        await until(lambda: not list(made.studio.zenoh.info.transports()))
+        assert load_site_certificate(tmp_path / "studio", datetime.now(UTC)).days_left(datetime.now(UTC)) > 390
+        with pytest.raises(CertificateError, match="valid from"):
+            load_site_certificate(tmp_path / "lobby", datetime.now(UTC))
+
+
+DIALLER = """
+import asyncio, sys
+from pathlib import Path
+from common.runtime.daemon import run_daemon, set_up_logging
+from common.transport.access_rules import for_receiver
+from common.transport.link_settings import LinkSettings
+from common.transport.zenoh_session import open_session
+set_up_logging()
+async def main(daemon):
+    settings = LinkSettings(certificates=Path(sys.argv[1]), connect=(sys.argv[2],))
+    async with open_session(settings, for_receiver("studio", "lobby.1")):
+        daemon.announce_ready()
+        await asyncio.Event().wait()
+sys.exit(run_daemon("dialler", main))
+"""
+
+
+async def test_a_dialling_process_has_no_port_open_to_anyone(sites: Path) -> None:
+    """A peer without listen endpoints would listen on plain TCP on every interface, whatever its TLS settings."""
+    port = free_port()
+    async with open_session(listening(sites, port), for_sender("studio", ["lobby"])) as studio:
+        command = [sys.executable, "-c", DIALLER, str(sites / "lobby"), f"127.0.0.1:{port}"]
+        process = await asyncio.create_subprocess_exec(*command, stderr=subprocess.DEVNULL)
+        try:
+            await until(lambda: len(studio.zenoh.info.links()) == 2)
+            ports = listening_ports(process.pid)
+            assert {protocol for protocol, _ in ports} == {"udp"}  # the QUIC client's own
+            for _, udp_port in ports:
+                with pytest.raises(zenoh.ZError):
+                    await asyncio.to_thread(outsider, pair(udp_port)[:1], sites / "studio")
+            assert {("tcp", port), ("udp", port)} <= listening_ports(os.getpid())
+        finally:
+            process.send_signal(signal.SIGTERM)
+            await process.wait()
+
+
+async def test_a_forgotten_plain_listener_is_an_error_at_the_start(sites: Path, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="would not be secured"):
+        LinkSettings(certificates=sites / "studio", listen=("tcp/0.0.0.0:7447",))
+    file = tmp_path / "zenoh.json5"
+    file.write_text(json.dumps({"listen": {"endpoints": ["tcp/127.0.0.1:0"]}}))
+    with pytest.raises(TransportError, match="protocol that the settings do not allow"):
+        async with open_session(LinkSettings(certificates=sites / "studio", config_file=file)):
+            pass
+
+
+async def test_garbage_and_idle_connections_cost_the_stream_nothing(sites: Path) -> None:
+    async with stream(sites) as made, AsyncExitStack() as stack:
+        datagrams = stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
+        for number in range(120):
+            connection = stack.enter_context(socket.create_connection(("127.0.0.1", made.port)))
+            if number % 2:
+                connection.sendall(os.urandom(600))
+            datagrams.sendto(os.urandom(1200), ("127.0.0.1", made.port))
+        before = len(made.skeletons.payloads)
+        for _ in range(30):
+            made.skeleton.put(b"skeleton")
+            await asyncio.sleep(0.01)
+        await until(lambda: len(made.skeletons.payloads) >= before + 30)
+        wall = await stack.enter_async_context(open_session(dialling(sites, made.port, "rogue")))
+        await until(lambda: len(wall.zenoh.info.links()) > 0, limit_s=5)
+        assert await made.flows()
+
+
+@pytest.mark.parametrize("certificate", ["studio", "lobby"])
+async def test_too_large_a_message_vanishes_and_the_stream_goes_on(sites: Path, certificate: str) -> None:
+    async with stream(sites) as made:
+        session, name = (made.studio, key(BODY)) if certificate == "studio" else (made.lobby, key(REPORT, NAME))
+        await asyncio.to_thread(session.zenoh.put, name, bytes(3 << 20))
+        assert await made.flows()
+        assert len(made.studio.zenoh.info.links()) == 2
+
+
+def change(folder: Path, what: str) -> None:
+    files = {"key": folder / "key.pem", "certificate": folder / "certificate.pem", "ca": folder / "ca.pem"}
+    if what == "no key":
+        files["key"].unlink()
+    elif what == "open key":
+        files["key"].chmod(0o644)
+    elif what == "junk key":
+        files["key"].write_text("junk")
+    elif what == "junk certificate":
+        files["certificate"].write_text("junk")
+    else:
+        other = new_authority()
+        certificate, another_key = new_certificate(other, "lobby")
+        write_site(folder / "other", other, certificate, another_key)
+        files[what.split()[1]].write_bytes((folder / "other" / files[what.split()[1]].name).read_bytes())
+
+
+@pytest.mark.parametrize(
+    ("what", "complaint"),
+    [
+        ("no key", r"key\.pem: No such file"),
+        ("open key", r"key\.pem: everyone on this host may read it; chmod 600"),
+        ("junk key", r"key\.pem: not an unencrypted private key"),
+        ("junk certificate", r"certificate\.pem: not a certificate"),
+        ("another key", r"key\.pem: not the key of "),
+        ("another ca", r"certificate\.pem: not issued by the authority in .*ca\.pem"),
+    ],
+)
+async def test_what_is_wrong_with_a_certificate_is_said(tmp_path: Path, what: str, complaint: str) -> None:
+    folder = make_sites(tmp_path) / "lobby"
+    change(folder, what)
+    with pytest.raises(CertificateError, match=complaint):
+        async with open_session(LinkSettings(certificates=folder, connect=("127.0.0.1:1",))):
+            pass
+
+
+async def test_sites_meet_at_a_router_each_with_its_own_keys(sites: Path, tmp_path: Path) -> None:
+    """Two senders and three receivers, as clients of the router of ``deploy/router.json5``."""
+    port = free_port()
+    router = await start_router(sites, tmp_path, port)
+    clients = {"mode": "client"}
+    try:
+        async with AsyncExitStack() as stack:
+            senders = {
+                site: await stack.enter_async_context(
+                    open_session(dialling(sites, port, site, **clients), for_sender(site, (), True))
+                )
+                for site in ("studio", "lobby")
+            }
+            receivers = {
+                (site, name): await stack.enter_async_context(
+                    open_session(
+                        dialling(sites, port, name.partition(".")[0], **clients), for_receiver(site, name, True)
+                    )
+                )
+                for site, name in (("studio", "lobby.1"), ("studio", "lobby.2"), ("lobby", "studio.1"))
+            }
+            heard = {
+                who: [
+                    Heard(session, SKELETON, key(SKELETON, site=who[0])),
+                    Heard(session, BULK, key(BULK, who[1], site=who[0])),
+                ]
+                for who, session in receivers.items()
+            }
+            await deliver(senders, heard)
+            stolen = Heard(receivers["lobby", "studio.1"], BULK, key(BULK, "lobby.1"))
+            rogue = await asyncio.to_thread(outsider, pair(port)[1:], sites / "rogue")
+            spied = list[str]()
+            spy = rogue.declare_subscriber("**", lambda sample: spied.append(str(sample.key_expr)))
+            await deliver(senders, heard)
+            spy.undeclare()  # type: ignore[no-untyped-call]
+            await asyncio.to_thread(_close, rogue)
+            assert (spied, stolen.payloads) == ([], [])
+    finally:
+        router.send_signal(signal.SIGTERM)
+        assert await router.wait() == 0
+
+
+async def start_router(sites: Path, folder: Path, port: int) -> asyncio.subprocess.Process:
+    text = (
+        ROUTER_FILE.read_text()
+        .replace("/etc/telepose/certificates", str(sites))
+        .replace("0.0.0.0:7447", f"127.0.0.1:{port}")
+    )
+    (folder / "router.json5").write_text(text)
+    return await asyncio.create_subprocess_exec(
+        *(sys.executable, "-m", "scripts.zenoh_router", "-c", str(folder / "router.json5"))
+    )
+
+
+async def deliver(senders: dict[str, ZenohSession], heard: dict[tuple[str, str], list[Heard]]) -> None:
+    """Until every receiver has its site's skeletons, published once for all, and its own chunks; and nothing else."""
+    publishers = {
+        site: ChannelPublisher(session, SKELETON, key(SKELETON, site=site)) for site, session in senders.items()
+    }
+    bulk = {who: ChannelPublisher(senders[who[0]], BULK, key(BULK, who[1], site=who[0])) for who in heard}
+    for inbox in (each for inboxes in heard.values() for each in inboxes):
+        inbox.payloads.clear()
+    async with asyncio.timeout(15):
+        while not all(inbox.payloads for inboxes in heard.values() for inbox in inboxes):
+            for site, publisher in publishers.items():
+                publisher.put(f"skeleton {site}".encode())
+            for (site, name), publisher in bulk.items():
+                publisher.put(f"chunk {site} {name}".encode() + bytes(50))
+            await asyncio.sleep(0.03)
+    for (site, name), (skeletons, chunks) in heard.items():
+        assert set(skeletons.payloads) == {f"skeleton {site}".encode()}
+        assert set(chunks.payloads) == {f"chunk {site} {name}".encode() + bytes(50)}
+
+
+def test_the_routers_file_is_what_the_command_prints() -> None:
+    text = "\n".join(line for line in ROUTER_FILE.read_text().splitlines() if not line.startswith("//"))
+    file = json.loads(text)
+    folder = Path(file["transport"]["link"]["tls"]["root_ca_certificate"]).parent
+    certificate = SiteCertificate(
+        "hub", datetime.now(UTC), *(folder / name for name in ("ca.pem", "certificate.pem", "key.pem"))
+    )
+    assert file == router_values(certificate, ["0.0.0.0:7447"], ["studio", "lobby"])
