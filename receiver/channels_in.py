@@ -13,7 +13,6 @@ from dataclasses import dataclass, field
 from common.body.skeleton import Skeleton
 from common.runtime.clock import Clock
 from common.transport import channels
-from common.transport.bulk_arrivals import BulkArrivals, LeastDelay
 from common.transport.channel_publisher import ChannelPublisher
 from common.transport.channel_query import ask
 from common.transport.channel_subscriber import Arrival, ChannelSubscriber
@@ -21,10 +20,11 @@ from common.transport.channels import Channel, channel_key
 from common.transport.chunks import ChunkAssembler, decode_chunk
 from common.transport.clock_exchange import exchange_times
 from common.transport.clock_offset import ClockOffset
+from common.transport.reception import Reception
 from common.transport.zenoh_session import ZenohSession
 from common.wire.body_message import decode_body
 from common.wire.header import WireError
-from common.wire.receiver_report import ReceiverReport, encode_report
+from common.wire.receiver_report import encode_report
 from common.wire.skeleton_packet import SkeletonPacket, decode_skeleton
 from receiver.skeleton_buffer import SkeletonBuffer
 
@@ -63,14 +63,10 @@ class ReceiverChannels:
         self.subscribers: dict[str, ChannelSubscriber] = {}
         self._session = session
         self._site, self._person, self._name = site, person, name
-        self._receiver_id, self._epoch = receiver_id, epoch
         self._clock = clock
-        self._arrivals = BulkArrivals()
-        self._skeleton_delay, self._bulk_delay = LeastDelay(), LeastDelay()
+        self._reception = Reception(receiver_id, epoch)
         self.first_skeleton_ns: int | None = None  # when the very first one arrived
-        self._skeleton_arrival_ns = 0
         self._bodies = _Bodies()
-        self._reports = 0
         self._report = ChannelPublisher(session, channels.REPORT, self._key(channels.REPORT, name))
         self._handlers: Handlers | None = None
 
@@ -94,26 +90,8 @@ class ReceiverChannels:
 
     def send_report(self, repository_poses: int) -> None:
         """Tell the sender's bulk window how things are."""
-        newest = self.skeletons.newest
         now_ns = self._clock.now_ns()
-        next_chunk, missing = self._arrivals.resolved()
-        self._reports += 1
-        report = ReceiverReport(
-            number=self._reports,
-            receiver_id=self._receiver_id,
-            receiver_epoch=self._epoch,
-            sender_epoch=self._arrivals.epoch if self._arrivals.epoch is not None else newest.epoch if newest else None,
-            clock_ns=now_ns,
-            skeleton_send_ns=newest.send_ns if newest else None,
-            skeleton_hold_ns=max(now_ns - self._skeleton_arrival_ns, 0) if newest else 0,
-            skeleton_delay_ns=self._skeleton_delay.take(),
-            bulk_delay_ns=self._bulk_delay.take(),
-            bulk_bytes=self._arrivals.bulk_bytes,
-            next_chunk=next_chunk,
-            missing_chunks=missing,
-            body_revision=self._bodies.newest_revision,
-            repository_poses=repository_poses,
-        )
+        report = self._reception.report(now_ns, self._bodies.newest_revision, repository_poses)
         self._report.put(encode_report(report))
 
     async def ask_time(self) -> None:
@@ -151,8 +129,7 @@ class ReceiverChannels:
             self._handlers.epoch()
         if self.first_skeleton_ns is None:
             self.first_skeleton_ns = arrival.arrival_ns
-        self._skeleton_arrival_ns = arrival.arrival_ns
-        self._skeleton_delay.note(packet.send_ns, arrival.arrival_ns)
+        self._reception.skeleton(packet.epoch, packet.send_ns, arrival.arrival_ns)
         if self._knows(packet):
             self._handlers.skeleton(packet, self._bodies.by_revision[packet.body_revision], arrival.payload)
         else:
@@ -176,8 +153,7 @@ class ReceiverChannels:
         assert self._handlers is not None
         chunk = decode_chunk(arrival.payload)
         message = self.assembler.push(chunk)
-        self._arrivals.note(chunk, len(arrival.payload))
-        self._bulk_delay.note(chunk.send_ns, arrival.arrival_ns)
+        self._reception.chunk(chunk, len(arrival.payload), arrival.arrival_ns)
         if message is not None:
             self._handlers.pose(message)
 

@@ -12,20 +12,18 @@ from collections import Counter, deque
 from dataclasses import dataclass
 
 from common.transport.chunks import CHUNK_MAX_BYTES
+from common.transport.path_delay import PathDelay
 from common.wire.receiver_report import ReceiverReport
 
 NS = 1e-9
-ROUND_TRIP_MAX_NS = 10_000_000_000
 FIRST_WINDOW_BYTES = 16 << 10
 CHUNK_LEAST_BYTES = 1200
-CHUNK_HOLDS_S = 0.008  # how long one chunk may hold up a skeleton behind it on the link
-BUCKET_NS, BUCKETS = 5_000_000_000, 12  # the delay's base is the least of the last minute
+CHUNK_HOLDS_S = 0.005  # how long one chunk may hold up a skeleton behind it on the link
 PACING = 1.1  # of the window per round trip: a little more than it allows, so that pacing is not the limit
 BURST_NS = 10_000_000  # how far pacing may lag behind and catch up
-GAIN = 2.0
+GAIN = 1.5
 SLOW_START_GAIN = 0.5
-BULK_SHARE = 0.5  # how much of the delay that only chunks see counts
-LOSS_FACTOR = 0.8
+LOSS_SHARE = 0.1  # of chunks lost beyond which a queue is taken to be full (GCC, draft-ietf-rmcat-gcc-02 §6)
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,7 +31,7 @@ class WindowSettings:
     """``target_ms``: queueing delay to stay at [ms]. ``floor_bps``: what bulk may use whatever the delay [bit/s].
     ``max_window_bytes``: most bytes in flight. ``report_period_ms``: how often the receiver reports [ms]."""
 
-    target_ms: float = 15.0
+    target_ms: float = 6.0
     floor_bps: int = 100_000
     max_window_bytes: int = 4 << 20
     report_period_ms: float = 50.0
@@ -61,61 +59,6 @@ class Outcome:
     restarted: bool = False
 
 
-class _LeastOfLate:
-    """The least value of the last ``BUCKETS`` x 5 s that had any."""
-
-    def __init__(self) -> None:
-        self._buckets: deque[tuple[int, int]] = deque(maxlen=BUCKETS)  # (which 5 s, least value in them)
-
-    def add(self, value: int, now_ns: int) -> None:
-        bucket = now_ns // BUCKET_NS
-        if self._buckets and self._buckets[-1][0] == bucket:
-            value = min(value, self._buckets.pop()[1])
-        self._buckets.append((bucket, value))
-
-    @property
-    def least(self) -> int | None:
-        return min((value for _, value in self._buckets), default=None)
-
-
-class _Path:
-    """Round trip and queueing delay, as the reports tell them. All in seconds."""
-
-    def __init__(self) -> None:
-        self.round_trip_s = 0.2  # until the first sample
-        self.queueing_s = 0.0
-        self._round_trips_ns = _LeastOfLate()
-        self._delays_ns = _LeastOfLate()
-
-    @property
-    def least_round_trip_s(self) -> float:
-        least_ns = self._round_trips_ns.least
-        return self.round_trip_s if least_ns is None else least_ns * NS
-
-    def update(self, report: ReceiverReport, chunk_s: float, acked_ns: int | None, now_ns: int) -> None:
-        """``chunk_s``: how long the link takes for one chunk. ``acked_ns``: when the newest chunk that this report
-        acknowledges was sent, or None."""
-        sent_ns, hold_ns = acked_ns, 0  # without skeletons: too long by what the chunk waited for the report
-        if report.skeleton_send_ns is not None:
-            sent_ns, hold_ns = report.skeleton_send_ns, report.skeleton_hold_ns
-        if sent_ns is not None and 0 < now_ns - sent_ns - hold_ns < ROUND_TRIP_MAX_NS:
-            sample_ns = now_ns - sent_ns - hold_ns
-            first = self._round_trips_ns.least is None
-            self.round_trip_s += (sample_ns * NS - self.round_trip_s) * (1 if first else 1 / 8)
-            self._round_trips_ns.add(sample_ns, now_ns)
-        d_s, d_b = report.skeleton_delay_ns, report.bulk_delay_ns
-        delays_ns = [delay_ns for delay_ns in (d_s, d_b) if delay_ns is not None]
-        if not delays_ns:
-            return
-        self._delays_ns.add(min(delays_ns), now_ns)
-        base_ns = self._delays_ns.least
-        assert base_ns is not None
-        seen_s = (d_s - base_ns) * NS if d_s is not None else 0.0
-        # Chunks may queue where skeletons do not, above a second link say: without this the window would not see it.
-        own_s = ((d_b - base_ns) * NS - chunk_s) * BULK_SHARE if d_b is not None else 0.0
-        self.queueing_s = max(seen_s, own_s, 0.0)
-
-
 class BulkWindow:
     """The window towards one receiver, for chunks of the sender's run ``epoch``.
 
@@ -132,10 +75,12 @@ class BulkWindow:
         self._in_flight_bytes = 0
         self._next_sequence = 0
         self._next_send_ns = 0
+        self._last_sent_ns = 0
         self._progress_ns = 0
         self._last: tuple[ReceiverReport, int] | None = None  # and when it came
-        self._path = _Path()
+        self._path = PathDelay()
         self._rates: deque[float] = deque(maxlen=40)  # R_i [bytes/s]
+        self._suspects: set[int] = set()  # missing in the last report: late, or lost
         self._begin_slow_start(FIRST_WINDOW_BYTES)
 
     @property
@@ -184,9 +129,18 @@ class BulkWindow:
 
     def next_send_ns(self, size: int, now_ns: int) -> int | None:
         """When a chunk of ``size`` bytes may go, perhaps in the past; None: not before another report."""
-        if self._silent(now_ns) or (self._in_flight and self._in_flight_bytes + size > self._window):
+        if self._silent(now_ns):
             return None
+        if self._in_flight and self._in_flight_bytes + size > self._window:
+            return self._probe_ns if self._probe_ns <= now_ns else None
         return self._next_send_ns
+
+    @property
+    def _probe_ns(self) -> int:
+        """When a full window lets one more chunk out: if the last ones were lost, only a later one shows it (RFC 8985
+        §7)."""
+        waited_ns = int(2 * (self._path.round_trip_s + self._period_s) / NS)
+        return max(self._progress_ns, self._last_sent_ns) + waited_ns
 
     def on_sent(self, size: int, now_ns: int) -> int:
         """A chunk of ``size`` bytes goes out now; returns its sequence number."""
@@ -196,6 +150,7 @@ class BulkWindow:
         self._next_sequence += 1
         self._in_flight[sequence] = (size, now_ns)
         self._in_flight_bytes += size
+        self._last_sent_ns = now_ns
         pace_bytes_s = PACING * self._window / (self._path.round_trip_s + self._period_s)
         self._next_send_ns = max(self._next_send_ns, now_ns - BURST_NS) + int(size / pace_bytes_s / NS)
         return sequence
@@ -216,15 +171,14 @@ class BulkWindow:
         if outcome.arrived:
             self._progress_ns = now_ns
         if was_silent:
-            self._begin_slow_start(FIRST_WINDOW_BYTES)
+            self._begin_anew()
         else:
             limited = outstanding > self._window / 2  # otherwise the sample says nothing about the path
             if acked and limited and before is not None:
                 period_s = max((report.clock_ns - before[0].clock_ns) * NS, self._period_s / 4)
                 self._rates.append(acked / period_s)
             self._adapt(acked if limited else 0, now_ns)
-        if outcome.lost:
-            self._reduce(now_ns)
+        self._heed_losses(acked, outstanding - self._in_flight_bytes - acked, now_ns)
         return outcome
 
     def expire(self, now_ns: int) -> Outcome:
@@ -232,7 +186,7 @@ class BulkWindow:
         if not self._in_flight or (now_ns - self._progress_ns) * NS <= max(1.0, 4 * self._path.round_trip_s):
             return Outcome()
         self.counts["written off"] += len(self._in_flight)
-        self._begin_slow_start(FIRST_WINDOW_BYTES)
+        self._begin_anew()
         return Outcome(lost=self._write_off())
 
     def _usable(self, report: ReceiverReport, now_ns: int) -> bool:
@@ -252,25 +206,29 @@ class BulkWindow:
         return self._last is None or (now_ns - self._last[1]) * NS > limit_s
 
     def _on_restart(self) -> Outcome:
-        self._path = _Path()
+        self._path = PathDelay()
         self._begin_slow_start(FIRST_WINDOW_BYTES)
         return Outcome(lost=self._write_off(), restarted=True)
 
     def _write_off(self) -> tuple[int, ...]:
         lost = tuple(self._in_flight)
         self._in_flight.clear()
+        self._suspects.clear()
         self._in_flight_bytes = 0
         return lost
 
     def _resolve(self, report: ReceiverReport) -> tuple[Outcome, int, int | None]:
-        """Chunks below "next expected" have arrived, but for the missing ones; with it how many bytes arrived, and when
-        the newest of them was sent."""
+        """Chunks below "next expected" have arrived, but for the missing ones, which are lost when a second report in
+        a row says so: before that they may just have been overtaken. With it how many bytes arrived, and when the
+        newest of them was sent."""
         if report.next_chunk > self._next_sequence:
             self.counts["future chunk"] += 1
-        missing = set(report.missing_chunks)
-        resolved = [sequence for sequence in self._in_flight if sequence < report.next_chunk]
-        lost = tuple(sequence for sequence in resolved if sequence in missing)
-        arrived = tuple(sequence for sequence in resolved if sequence not in missing)
+        missing = set(report.missing_chunks) & self._in_flight.keys()
+        lost = tuple(sorted(missing & self._suspects))
+        self._suspects = missing.difference(lost)
+        arrived = tuple(
+            sequence for sequence in self._in_flight if sequence < report.next_chunk and sequence not in missing
+        )
         acked_ns = self._in_flight[arrived[-1]][1] if arrived else None
         lost_bytes, acked = (sum(self._in_flight.pop(chunk)[0] for chunk in chunks) for chunks in (lost, arrived))
         self._in_flight_bytes -= lost_bytes + acked
@@ -282,24 +240,35 @@ class BulkWindow:
         self._window = float(window_bytes)
         self._rates.clear()
         self._short_queue_since_ns: int | None = None
+        self._loss_share = 0.0
         self._reduced_ns = 0
+
+    def _begin_anew(self) -> None:
+        """After silence: nothing is known of the path but that it was once as fast as it was."""
+        window = self.rate_bytes_s * (self._path.least_round_trip_s + self._period_s) / 2
+        self._begin_slow_start(min(window, FIRST_WINDOW_BYTES))
+        self._clamp()
 
     def _adapt(self, acked: int, now_ns: int) -> None:
         """The new window after ``acked`` bytes arrived while it was the window that limited them."""
-        q, target = self._path.queueing_s, self._target_s
+        q = self._path.queueing_s
+        chunk_s = self.chunk_bytes / self.rate_bytes_s
+        target = max(self._target_s, min(chunk_s, 2 * self._target_s))  # on a slow link one chunk alone takes so long
         round_trip_s = self._path.least_round_trip_s + self._period_s
+        heeded = now_ns < self._reduced_ns + int(round_trip_s / NS)  # the queue that the last cut will drain
         if self._slow_start:
             if q > target / 2 and self._rates:
                 self._slow_start = False
-                self._window = max(list(self._rates)[-4:]) * round_trip_s
+                self._reduced_ns = now_ns
+                self._window = max(list(self._rates)[-4:]) * (round_trip_s + target)
             else:
                 self._window += acked * SLOW_START_GAIN
-        elif acked:
+        elif acked and not (heeded and q > target):
             gain = GAIN * max(1.0, round_trip_s / 0.1)
-            self._window += max(
-                -self._window / 4, gain * (target - q) / target * acked * self.chunk_bytes / self._window
-            )
-        if q > 3 * target and self._rates:
+            step = gain * (target - q) / target * acked * self.chunk_bytes / self._window
+            self._window += max(-acked / 4, step)
+        if q > 3 * target and self._rates and not heeded and not self._slow_start:
+            self._reduced_ns = now_ns
             self._window = min(self._window, 0.85 * self._rates[-1] * round_trip_s)
         self._clamp()
         self._seek_room(acked, now_ns)
@@ -310,16 +279,23 @@ class BulkWindow:
             self._short_queue_since_ns = None
         elif self._short_queue_since_ns is None:
             self._short_queue_since_ns = now_ns if acked else None
-        elif (now_ns - self._short_queue_since_ns) * NS > max(1.0, 3 * (self._path.round_trip_s + self._period_s)):
+        elif (now_ns - self._short_queue_since_ns) * NS > max(0.5, 2 * (self._path.round_trip_s + self._period_s)):
             self._short_queue_since_ns = None
             self._slow_start = acked > 0
 
-    def _reduce(self, now_ns: int) -> None:
-        """Chunks were lost: a queue somewhere is full, though short. Once per round trip."""
-        if (now_ns - self._reduced_ns) * NS > self._path.round_trip_s + self._period_s:
+    def _heed_losses(self, acked: int, lost: int, now_ns: int) -> None:
+        """Give way when many chunks are lost: a queue somewhere is full, though short. Once per round trip. A few that
+        are lost by chance are no such sign."""
+        if acked + lost:
+            weight = min(1.0, (acked + lost) / self._window)
+            self._loss_share += (lost / (acked + lost) - self._loss_share) * weight
+        if (
+            self._loss_share > LOSS_SHARE
+            and (now_ns - self._reduced_ns) * NS > self._path.round_trip_s + self._period_s
+        ):
             self._reduced_ns = now_ns
             self._slow_start = False
-            self._window *= LOSS_FACTOR
+            self._window *= 1 - self._loss_share / 2
             self._clamp()
 
     def _clamp(self) -> None:
