@@ -8,7 +8,7 @@ from typing import Literal
 
 from common.body.body_regions import DEFAULT_WEIGHTS, region_weights
 from common.body.joint_edges import ScoreForm
-from common.runtime.metrics import MetricsSettings
+from common.runtime.http_access import HttpSettings
 from common.transport.link_settings import LinkSettings
 
 
@@ -78,8 +78,10 @@ class ReceiverSettings:
     link: LinkSettings = field(default_factory=LinkSettings)
     repository: RepositorySettings = field(default_factory=RepositorySettings)
     view: ViewSettings = field(default_factory=ViewSettings)
-    http: MetricsSettings = field(default_factory=lambda: MetricsSettings(port=8080))
+    http: HttpSettings = field(default_factory=lambda: HttpSettings(port=8080))
 
     def __post_init__(self) -> None:
         if not 0 <= self.person <= 255:
             raise ValueError(f"person: {self.person} is outside 0..255")
+        if self.view.window and (self.http.token_file or self.http.certificates):
+            raise ValueError("[view] window: follows the page, which for that must be plain HTTP on loopback")

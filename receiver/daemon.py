@@ -20,6 +20,7 @@ from common.runtime.clock import MonotonicClock
 from common.runtime.compute_worker import ComputeWorker
 from common.runtime.config_file import dump_settings
 from common.runtime.daemon import Daemon, DaemonError
+from common.runtime.http_access import read_token, tls_context
 from common.runtime.metrics import Health, Metrics, daemon_app, serve_app
 from common.runtime.run_statistics import RunStatistics, write_statistics
 from common.runtime.stage_timer import StageTimer
@@ -71,14 +72,16 @@ class ReceiverDaemon:
             name = receiver_name(certificate.name, name)
         async with open_session(link, for_receiver(settings.site, name, link.mode == "client")) as session:
             show = _Show(settings, name, session, self._clock, self._health)
-            app = daemon_app(show.metrics, self._health)
+            http = settings.http
+            app = daemon_app(show.metrics, self._health, read_token(http))
+            tls = tls_context(http)
             if isinstance(show.viewer, WebViewer):
                 show.viewer.add_routes(app)
             try:
-                async with serve_app(app, settings.http.host, settings.http.port) as port:
+                async with serve_app(app, http.host, http.port, tls) as port:
                     what = "metrics" if settings.view.headless else "the page"
-                    log.info("%s on http://%s:%d/", what, settings.http.host, port)
-                    await show.run(daemon, _page_address(settings.http.host, port))
+                    log.info("%s on %s://%s:%d/", what, "https" if tls else "http", http.host, port)
+                    await show.run(daemon, _page_address(http.host, port))
             except OSError as error:
                 raise DaemonError(f"http: {error}") from error
             finally:

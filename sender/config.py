@@ -9,7 +9,7 @@ from typing import Literal
 from common.body.body_regions import DEFAULT_WEIGHTS, region_weights
 from common.body.joint_edges import ScoreForm
 from common.body.rigging import Segmentation, Views
-from common.runtime.metrics import MetricsSettings
+from common.runtime.http_access import HttpSettings
 from common.transport.channels import check_name
 from common.transport.link_settings import LinkSettings
 
@@ -138,7 +138,7 @@ class SenderSettings:
     tracking: TrackingSettings = field(default_factory=TrackingSettings)
     poses: CandidateSettings = field(default_factory=CandidateSettings)
     self_view: SelfViewSettings = field(default_factory=SelfViewSettings)
-    http: MetricsSettings = field(default_factory=lambda: MetricsSettings(port=9101))
+    http: HttpSettings = field(default_factory=lambda: HttpSettings(port=9101))
 
     def __post_init__(self) -> None:
         if not 0 <= self.person <= 255:

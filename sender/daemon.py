@@ -17,6 +17,7 @@ from common.runtime.clock import MonotonicClock
 from common.runtime.compute_worker import ComputeWorker
 from common.runtime.config_file import dump_settings
 from common.runtime.daemon import Daemon, DaemonError
+from common.runtime.http_access import read_token, tls_context
 from common.runtime.metrics import Health, Metrics, daemon_app, serve_app
 from common.runtime.run_statistics import RunStatistics, write_statistics
 from common.runtime.stage_timer import StageTimer
@@ -117,11 +118,12 @@ class SenderDaemon:
         self_view: SelfView | None,
     ) -> None:
         stream = _Stream(self._settings, source, session, store, body, self._clock, self._health, self_view)
-        app = daemon_app(stream.metrics, self._health)
         http = self._settings.http
+        app = daemon_app(stream.metrics, self._health, read_token(http))
+        tls = tls_context(http)
         try:
-            async with serve_app(app, http.host, http.port) as port:
-                log.info("metrics on http://%s:%d/metrics", http.host, port)
+            async with serve_app(app, http.host, http.port, tls) as port:
+                log.info("metrics on %s://%s:%d/metrics", "https" if tls else "http", http.host, port)
                 await stream.run(daemon)
         except OSError as error:
             raise DaemonError(f"http: {error}") from error

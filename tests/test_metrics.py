@@ -10,7 +10,7 @@ from aiohttp import web
 
 from common.runtime.clock import ManualClock
 from common.runtime.daemon import DaemonError
-from common.runtime.metrics import Health, Metrics, MetricsSettings, daemon_app, serve_app
+from common.runtime.metrics import Health, Metrics, daemon_app, serve_app
 from common.runtime.stage_timer import StageTimer
 
 
@@ -76,8 +76,3 @@ async def test_a_port_in_use_is_named() -> None:
         with pytest.raises(DaemonError, match=rf"cannot serve http://127\.0\.0\.1:{port}: .*in use"):
             async with serve_app(daemon_app(Metrics(), Health()), "127.0.0.1", port):
                 pass
-
-
-def test_a_port_outside_the_range_is_refused() -> None:
-    with pytest.raises(ValueError, match="65536"):
-        MetricsSettings(port=65536)

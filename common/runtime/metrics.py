@@ -5,6 +5,8 @@ Counters live where things are counted, in plain integers; this module reads the
 
 from __future__ import annotations
 
+import ssl
+from collections import Counter
 from collections.abc import AsyncIterator, Callable, Iterable, Mapping
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
@@ -14,22 +16,11 @@ from prometheus_client import CollectorRegistry, generate_latest
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
 
 from common.runtime.daemon import DaemonError
+from common.runtime.http_access import require_token
 from common.runtime.stage_timer import StageTimer
 
 Labelled = Mapping[str, float]  # label value → number
 CONTENT_TYPE = "text/plain; version=0.0.4; charset=utf-8"
-
-
-@dataclass(frozen=True, slots=True)
-class MetricsSettings:
-    """Where /healthz, /readyz and /metrics are served. Anyone who reaches the port may read: keep it on loopback."""
-
-    host: str = "127.0.0.1"
-    port: int = 0  # 0: any free port, named in the log
-
-    def __post_init__(self) -> None:
-        if not 0 <= self.port <= 65535:
-            raise ValueError(f"port: {self.port} is outside 0..65535")
 
 
 class Metrics:
@@ -109,8 +100,11 @@ class Health:
     reason: str = "starting"
 
 
-def daemon_app(metrics: Metrics, health: Health) -> web.Application:
-    """An aiohttp application with /healthz, /readyz and /metrics; others may add their routes before it is served."""
+def daemon_app(metrics: Metrics, health: Health, token: str | None = None) -> web.Application:
+    """An aiohttp application with /healthz, /readyz and /metrics; others may add their routes before it is served.
+
+    With a ``token``, every request to any of them has to show it.
+    """
 
     def verdict(good: bool) -> web.Response:
         return web.Response(status=200 if good else 503, text="ok\n" if good else f"{health.reason}\n")
@@ -124,13 +118,18 @@ def daemon_app(metrics: Metrics, health: Health) -> web.Application:
     async def numbers(_: web.Request) -> web.Response:
         return web.Response(body=metrics.text(), headers={"Content-Type": CONTENT_TYPE})
 
-    app = web.Application()
+    refused: Counter[str] = Counter()
+    app = web.Application(middlewares=[require_token(token, refused)] if token is not None else [])
+    if token is not None:
+        metrics.counter("http_refused_total", "Requests without the right token, by cause", lambda: refused)
     app.add_routes([web.get("/healthz", healthz), web.get("/readyz", readyz), web.get("/metrics", numbers)])
     return app
 
 
 @asynccontextmanager
-async def serve_app(app: web.Application, host: str, port: int) -> AsyncIterator[int]:
+async def serve_app(
+    app: web.Application, host: str, port: int, tls: ssl.SSLContext | None = None
+) -> AsyncIterator[int]:
     """Serve the application while the context lasts; gives the port it listens on (``port`` 0: any free one).
 
     Raises:
@@ -140,9 +139,9 @@ async def serve_app(app: web.Application, host: str, port: int) -> AsyncIterator
     await runner.setup()
     try:
         try:
-            await web.TCPSite(runner, host, port).start()
+            await web.TCPSite(runner, host, port, ssl_context=tls).start()
         except OSError as error:
-            raise DaemonError(f"cannot serve http://{host}:{port}: {error.strerror}") from error
+            raise DaemonError(f"cannot serve http{'s' if tls else ''}://{host}:{port}: {error.strerror}") from error
         yield int(runner.addresses[0][1])
     finally:
         await runner.cleanup()

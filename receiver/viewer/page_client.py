@@ -47,7 +47,8 @@ async def follow(page: str) -> AsyncGenerator[PageView, None]:
                     view.take_text(message.data)
                 yield view
     except aiohttp.WSServerHandshakeError as error:
-        why = "refuses this name: it is not in [view] allowed_hosts" if error.status == 403 else "is no receiver's page"
+        known = {401: "needs a token", 403: "refuses this name: it is not in [view] allowed_hosts"}
+        why = known.get(error.status, "is no receiver's page")
         raise PageError(f"{page} {why} (HTTP {error.status})") from error
     except (aiohttp.ClientError, OSError, TimeoutError) as error:
         raise PageError(f"no receiver answers at {page}: {str(error) or 'timeout'}") from error
