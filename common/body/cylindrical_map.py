@@ -1,0 +1,260 @@
+"""Residual maps' grids (Lien §5.2): a posed person's points → colour and radius in cells of links' cylinders, and back.
+
+A point has, in its link's cylinder, an angle around the axis, a height along it and a radius, its distance from the
+axis. Beyond an end it has its angle to the end's plane in place of a height and its distance from the end in place of
+a radius: round caps, joined to the cylinder without a step. None of these change when link and points move together
+rigidly. A cell keeps the mean of its points, without those well behind the outermost: a sleeve hides the arm in it.
+
+What is lost on the way there and back: the place within a cell, at most half of ``cell_m`` along and half across, the
+latter times radius / R_l where the surface is not at R_l, on a cap both times radius over the cap's; and the radius,
+rounded to 2 mm, so at most 1 mm.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from common.body.map_layout import MapLayout
+
+RADIUS_STEP_M = 0.002
+RADIUS_MAX = 255  # steps: 51 cm; a point farther out is put there
+_SAME_SURFACE_M = 0.03  # behind the outermost point of a cell: another surface
+_CLOSING_NEIGHBOURS = 5  # of 8: an empty cell among so many full ones is a gap between points, not a hole
+_CLOSING_PASSES = 4
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LinkMaps:
+    """One frame's maps of all links in one atlas (H, W) of a layout.
+
+    ``full`` (H, W) bool: cells that hold surface. ``colour`` (H, W, 3) uint8 RGB and ``radius`` (H, W) uint8 [2 mm]:
+    zero in empty cells.
+    """
+
+    full: NDArray[np.bool_]
+    colour: NDArray[np.uint8]
+    radius: NDArray[np.uint8]
+
+
+def project_points(
+    layout: MapLayout,
+    T_world_link: NDArray[np.float32],
+    links: NDArray[np.uint8],
+    positions: NDArray[np.float32],
+    colours: NDArray[np.uint8],
+) -> LinkMaps:
+    """The maps of points (N, 3) [m, world] with ``colours`` (N, 3) RGB, each of one of the posed ``links`` (N,)."""
+    cells, radii = _cells_of(positions, links, _into_cylinders(layout, T_world_link), layout.sizes, layout.places,
+                             layout.width)  # fmt: skip
+    full, colour, radius = _gathered(cells, radii, colours, layout.height * layout.width)
+    shape = layout.height, layout.width
+    return LinkMaps(full.reshape(shape), colour.reshape(*shape, 3), radius.reshape(shape))
+
+
+def closed(layout: MapLayout, maps: LinkMaps) -> LinkMaps:
+    """``maps`` with the gaps between points filled by their neighbours' mean; around a link the grid has no border."""
+    out = LinkMaps(maps.full.copy(), maps.colour.copy(), maps.radius.copy())
+    for _ in range(_CLOSING_PASSES):
+        if not _close(layout.places, out.full.copy(), out.full, out.colour, out.radius):
+            break
+    return out
+
+
+def resampled(layout: MapLayout, maps: LinkMaps, finer: MapLayout) -> LinkMaps:
+    """The same surface on another layout of the same body, interpolated between the full cells."""
+    shape = finer.height, finer.width
+    out = LinkMaps(np.zeros(shape, np.bool_), np.zeros((*shape, 3), np.uint8), np.zeros(shape, np.uint8))
+    _resample(layout.places, maps.full, maps.colour, maps.radius, finer.places, out.full, out.colour, out.radius)
+    return out
+
+
+def unproject(
+    layout: MapLayout, maps: LinkMaps, T_world_link: NDArray[np.float32]
+) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.uint8]]:
+    """Positions (N, 3) [m, world], outward directions (N, 3) and colours (N, 3) of the full cells' middles, posed.
+
+    A cap's cells get narrow towards its pole: there, of every two, three… the first full one is given.
+    """
+    to_world = _into_cylinders(layout, T_world_link)
+    R = np.ascontiguousarray(np.swapaxes(to_world[:, :, :3], 1, 2))
+    origins = np.ascontiguousarray(T_world_link[:, :3, 3], np.float32)
+    most = int(np.count_nonzero(maps.full))
+    positions, normals = np.empty((most, 3), np.float32), np.empty((most, 3), np.float32)
+    colours = np.empty((most, 3), np.uint8)
+    n = _points_of(layout.places, layout.sizes, R, origins, maps.full, maps.colour, maps.radius,
+                   positions, normals, colours)  # fmt: skip
+    return positions[:n], normals[:n], colours[:n]
+
+
+def _into_cylinders(layout: MapLayout, T_world_link: NDArray[np.float32]) -> NDArray[np.float32]:
+    """(L, 3, 4): world → front, side and axis coordinates of each posed link's cylinder."""
+    R = layout.cylinders @ np.swapaxes(T_world_link[:, :3, :3], 1, 2)
+    t = -np.einsum("lij,lj->li", R, T_world_link[:, :3, 3])
+    return np.concatenate([R, t[:, :, None]], axis=2).astype(np.float32)
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _cells_of(positions, links, into, sizes, places, width):  # type: ignore[no-untyped-def]
+    """Cell in the atlas (N,) int32 and radius (N,) [m] of each point."""
+    cells, radii = np.empty(len(positions), np.int32), np.empty(len(positions), np.float32)
+    turn = np.float32(2 * np.pi)
+    for n in range(len(positions)):
+        link = links[n]
+        m = into[link]
+        x, y, z = positions[n, 0], positions[n, 1], positions[n, 2]
+        front = m[0, 0] * x + m[0, 1] * y + m[0, 2] * z + m[0, 3]
+        side = m[1, 0] * x + m[1, 1] * y + m[1, 2] * z + m[1, 3]
+        along = m[2, 0] * x + m[2, 1] * y + m[2, 2] * z + m[2, 3]
+        length, cap = sizes[link, 0], sizes[link, 1]
+        radius = np.sqrt(front * front + side * side)
+        beyond = along if along < 0 else max(along - length, np.float32(0))
+        height = min(max(along, np.float32(0)), length) + cap * np.float32(np.arctan2(beyond, radius))
+        radii[n] = np.sqrt(radius * radius + beyond * beyond)
+        top, left, rows, columns = places[link]
+        cap_arc = cap * turn / 4
+        row = int((height + cap_arc) / (length + 2 * cap_arc) * rows)
+        column = int((np.float32(np.arctan2(side, front)) / turn + np.float32(0.5)) * columns)
+        row, column = min(max(row, 0), rows - 1), min(max(column, 0), columns - 1)
+        cells[n] = (top + row) * width + left + column
+    return cells, radii
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _gathered(cells, radii, colours, count):  # type: ignore[no-untyped-def]
+    """Mean colour and radius of each cell's outermost points."""
+    outermost, number = np.zeros(count, np.float32), np.zeros(count, np.float32)
+    sums = np.zeros((count, 4), np.float32)
+    for n in range(len(cells)):
+        outermost[cells[n]] = max(outermost[cells[n]], radii[n])
+    for n in range(len(cells)):
+        cell = cells[n]
+        if radii[n] >= outermost[cell] - np.float32(_SAME_SURFACE_M):
+            number[cell] += 1
+            sums[cell, 3] += radii[n]
+            for c in range(3):
+                sums[cell, c] += colours[n, c]
+    full, colour, radius = np.zeros(count, np.bool_), np.zeros((count, 3), np.uint8), np.zeros(count, np.uint8)
+    for cell in range(count):
+        if number[cell] > 0:
+            full[cell] = True
+            for c in range(3):
+                colour[cell, c] = np.uint8(sums[cell, c] / number[cell] + np.float32(0.5))
+            steps = sums[cell, 3] / number[cell] / np.float32(RADIUS_STEP_M) + np.float32(0.5)
+            radius[cell] = np.uint8(min(steps, np.float32(RADIUS_MAX)))
+    return full, colour, radius
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _close(places, before, full, colour, radius):  # type: ignore[no-untyped-def]
+    """Fill cells that were empty ``before`` among at least five full neighbours, in place; returns how many."""
+    filled = 0
+    for link in range(len(places)):
+        top, left, rows, columns = places[link]
+        for row in range(rows):
+            up, down = max(row - 1, 0), min(row + 1, rows - 1)
+            for column in range(columns):
+                v, u = top + row, left + column
+                if before[v, u]:
+                    continue
+                west, east = left + (column - 1) % columns, left + (column + 1) % columns
+                if not (before[v, west] or before[v, east] or before[top + up, u] or before[top + down, u]):
+                    continue  # the four at the corners are too few: most of the void is done with here
+                count = np.int64(0)
+                for y in range(top + up, top + down + 1):
+                    count += np.int64(before[y, west]) + np.int64(before[y, u]) + np.int64(before[y, east])
+                if count >= _CLOSING_NEIGHBOURS:
+                    _fill_by_mean(before, full, colour, radius, v, u, (top + up, top + down), (west, u, east))
+                    filled += 1
+    return filled
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _fill_by_mean(before, full, colour, radius, v, u, rows, columns):  # type: ignore[no-untyped-def]
+    """Cell (v, u) becomes the mean of those of ``rows`` (first, last) and ``columns`` that were full ``before``."""
+    count = red = green = blue = steps = np.int64(0)
+    for y in range(rows[0], rows[1] + 1):
+        for x in columns:
+            if before[y, x]:
+                count += 1
+                steps += radius[y, x]
+                red += colour[y, x, 0]
+                green += colour[y, x, 1]
+                blue += colour[y, x, 2]
+    half = count // 2
+    full[v, u] = True
+    radius[v, u] = (steps + half) // count
+    colour[v, u, 0], colour[v, u, 1] = (red + half) // count, (green + half) // count
+    colour[v, u, 2] = (blue + half) // count
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _resample(places, full, colour, radius, finer, out_full, out_colour, out_radius):  # type: ignore[no-untyped-def]
+    """Bilinear between the full cells of ``places``; a cell is full where these weigh at least half."""
+    half = np.float32(0.5)
+    sums = np.zeros(4, np.float32)
+    for link in range(len(places)):
+        top, left, rows, columns = places[link]
+        out_top, out_left, out_rows, out_columns = finer[link]
+        for row in range(out_rows):
+            y = (np.float32(row) + half) * np.float32(rows) / np.float32(out_rows) - half
+            y0 = int(np.floor(y))
+            fy = y - np.float32(y0)
+            for column in range(out_columns):
+                x = (np.float32(column) + half) * np.float32(columns) / np.float32(out_columns) - half
+                x0 = int(np.floor(x))
+                fx = x - np.float32(x0)
+                weight = np.float32(0)
+                sums[:] = 0
+                for down in range(2):
+                    v = top + min(max(y0 + down, 0), rows - 1)
+                    wy = fy if down else 1 - fy
+                    for across in range(2):
+                        u = left + (x0 + across) % columns
+                        if full[v, u]:
+                            w = wy * (fx if across else 1 - fx)
+                            weight += w
+                            sums[3] += w * radius[v, u]
+                            for c in range(3):
+                                sums[c] += w * colour[v, u, c]
+                if weight >= half:
+                    v, u = out_top + row, out_left + column
+                    out_full[v, u] = True
+                    out_radius[v, u] = np.uint8(sums[3] / weight + half)
+                    for c in range(3):
+                        out_colour[v, u, c] = np.uint8(sums[c] / weight + half)
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _points_of(places, sizes, R, origins, full, colour, radius, positions, normals, colours):  # type: ignore[no-untyped-def]
+    """Fill the arrays with the full cells' points, return how many there are."""
+    n = 0
+    for link in range(len(places)):
+        top, left, rows, columns = places[link]
+        length, cap = sizes[link, 0], sizes[link, 1]
+        quarter = np.float32(np.pi / 2)
+        for row in range(rows):
+            height = (np.float32(row) + np.float32(0.5)) / rows * (length + 2 * cap * quarter) - cap * quarter
+            along = min(max(height, np.float32(0)), length)
+            slope = (height - along) / cap  # angle beyond the end
+            cosine, sine = np.float32(np.cos(slope)), np.float32(np.sin(slope))
+            every = min(int(1 / max(cosine, np.float32(1e-3))), columns)
+            given = -1  # of so many columns the first full one
+            for column in range(columns):
+                v, u = top + row, left + column
+                if not full[v, u] or column // every == given:
+                    continue
+                given = column // every
+                angle = ((np.float32(column) + np.float32(0.5)) / columns * 4 - 2) * quarter
+                distance = np.float32(radius[v, u]) * np.float32(RADIUS_STEP_M)
+                front, side = cosine * np.float32(np.cos(angle)), cosine * np.float32(np.sin(angle))
+                for i in range(3):
+                    outward = R[link, i, 0] * front + R[link, i, 1] * side + R[link, i, 2] * sine
+                    normals[n, i] = outward
+                    positions[n, i] = origins[link, i] + R[link, i, 2] * along + outward * distance
+                    colours[n, i] = colour[v, u, i]
+                n += 1
+    return n
