@@ -1,0 +1,285 @@
+"""One frame's link maps in three sections of bytes: which cells are full, their radii, their colours.
+
+Occupancy: a bit a cell, zstd. Radius: rounded to a step, what its neighbours to the left and above let expect taken off
+(the median of left, above and left + above - corner), full cells only, zstd; or a PNG of the rounded map. Colour: JPEG
+with chroma at half resolution, without its header, which is the same for all pictures of one size and quality and is
+600 bytes of a few thousand; empty cells hold the mean of the full ones in their 8 × 8 block, so nothing rings.
+
+Radius decides: sensors' noise is white, so a transform saves nothing on it, and a silhouette shows every millimetre;
+colours a third as good cost 0.1 dB. Against a reference colours are differences, coded in the same way; radii are too
+where that is shorter, which it seldom is: the reference has noise of its own.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import cv2
+import numpy as np
+import zstandard
+from numba import njit
+from numpy.typing import NDArray
+
+from common.body.cylindrical_map import LinkMaps
+from common.body.map_layout import BLOCK, MapLayout
+from common.wire.header import WireError
+
+RADIUS_STEPS_MAX = 16  # of 2 mm
+RADIUS_CODINGS = ("zstd", "png")
+
+_ZSTD_LEVEL = 3  # higher levels gain a hundredth
+_START_OF_SCAN, _END = b"\xff\xda", b"\xff\xd9"
+_MIDDLE = 128  # a colour difference of zero; beyond ±127 it is cut
+_PNG_START, _PNG_CHUNKS = b"\x89PNG\r\n\x1a\n", {b"IHDR", b"IDAT", b"IEND"}
+
+
+@dataclass(frozen=True, slots=True)
+class MapQuality:
+    """``jpeg`` 1..100 of the colours; ``radius_steps`` 1..16: radii are rounded to so many times 2 mm;
+    ``radius_coding``: "zstd" or "png"."""
+
+    jpeg: int
+    radius_steps: int
+    radius_coding: str = "zstd"
+
+
+@dataclass(frozen=True, slots=True)
+class MapSections:
+    """The three parts of a frame in bytes. ``radius_differs``: radii are differences from the reference."""
+
+    occupancy: bytes
+    radius: bytes
+    colour: bytes
+    radius_differs: bool = False
+
+
+def reference_of(maps: LinkMaps) -> LinkMaps:
+    """Decoded maps as what others differ from: empty cells are like the full ones in their block, which is where a cell
+    new in the next frame starts from."""
+    colour, radius = np.empty_like(maps.colour), np.empty((*maps.radius.shape, 1), np.uint8)
+    _fill(maps.colour, maps.full, np.full(3, _MIDDLE, np.uint8), colour)
+    _fill(maps.radius[..., None], maps.full, np.zeros(1, np.uint8), radius)
+    return LinkMaps(maps.full, colour, radius[..., 0])
+
+
+def encode_maps(
+    layout: MapLayout, maps: LinkMaps, quality: MapQuality, reference: LinkMaps | None = None
+) -> MapSections:
+    """The sections of ``maps``, or of how they differ from ``reference`` (``reference_of`` maps of the same layout)."""
+    occupancy = zstandard.ZstdCompressor(level=_ZSTD_LEVEL).compress(np.packbits(maps.full).tobytes())
+    radius = _encode_radius(layout, maps, quality, None)
+    differing = radius if reference is None else _encode_radius(layout, maps, quality, reference)
+    differs = len(differing) < len(radius)
+    colour = maps.colour if reference is None else _difference(maps.colour, reference.colour)
+    filled = np.empty_like(colour)
+    _fill(colour, maps.full, np.full(3, _MIDDLE, np.uint8), filled)
+    _, jpeg = cv2.imencode(".jpg", cv2.cvtColor(filled, cv2.COLOR_RGB2BGR), _jpeg_settings(quality.jpeg))
+    start = _jpeg_start(layout.height, layout.width, quality.jpeg)
+    data = jpeg.tobytes()
+    assert data.startswith(start)
+    return MapSections(occupancy, differing if differs else radius, data[len(start) : -len(_END)], differs)
+
+
+def decode_maps(
+    layout: MapLayout, sections: MapSections, quality: MapQuality, reference: LinkMaps | None = None
+) -> LinkMaps:
+    """The maps of ``encode_maps``'s sections: of the layout's size, whatever the bytes declare.
+
+    Raises:
+        WireError: sections that no encoder writes for this layout.
+    """
+    height, width = layout.height, layout.width
+    bits = np.frombuffer(_decompressed("occupancy", sections.occupancy, -(-height * width // 8)), np.uint8)
+    full = np.unpackbits(bits, count=height * width).reshape(height, width).view(np.bool_)
+    if np.count_nonzero(full) != _full_in_grids(layout.places, full):
+        raise WireError("occupancy: cells are full that belong to no link")
+    if sections.radius_differs and reference is None:
+        raise WireError("radius: a difference without a reference")
+    radius = _decode_radius(layout, sections.radius, full, quality, reference if sections.radius_differs else None)
+    colour = _decode_colour(sections.colour, height, width, quality.jpeg)
+    if reference is not None:
+        colour = np.clip(reference.colour.astype(np.int16) + colour - _MIDDLE, 0, 255).astype(np.uint8)
+    return LinkMaps(full, np.where(full[..., None], colour, np.uint8(0)), radius)
+
+
+def _encode_radius(layout: MapLayout, maps: LinkMaps, quality: MapQuality, reference: LinkMaps | None) -> bytes:
+    step = quality.radius_steps
+    rounded = _rounded(maps.radius, step)
+    if reference is not None:  # modulo 256, which is undone
+        rounded = rounded - _rounded(reference.radius, step) + np.uint8(_MIDDLE)
+    if quality.radius_coding == "png":
+        rounded[~maps.full] = 0
+        return bytes(cv2.imencode(".png", rounded)[1].tobytes())
+    unexpected = np.empty(int(np.count_nonzero(maps.full)), np.uint8)
+    _take_off(layout.places, maps.full, rounded, unexpected)
+    return zstandard.ZstdCompressor(level=_ZSTD_LEVEL).compress(unexpected.tobytes())
+
+
+def _decode_radius(
+    layout: MapLayout, data: bytes, full: NDArray[np.bool_], quality: MapQuality, reference: LinkMaps | None
+) -> NDArray[np.uint8]:
+    step = quality.radius_steps
+    if quality.radius_coding == "png":
+        rounded = _decode_png(data, *full.shape)
+    else:
+        unexpected = np.frombuffer(_decompressed("radius", data, int(np.count_nonzero(full))), np.uint8)
+        rounded = np.zeros(full.shape, np.uint8)
+        _put_back(layout.places, full, unexpected, rounded)
+    if reference is not None:
+        rounded = rounded + _rounded(reference.radius, step) - np.uint8(_MIDDLE)
+    radius = np.minimum(rounded.astype(np.uint16) * step, 255).astype(np.uint8)
+    return np.where(full, radius, np.uint8(0))
+
+
+def _rounded(radius: NDArray[np.uint8], step: int) -> NDArray[np.uint8]:
+    return radius.copy() if step == 1 else ((radius.astype(np.uint16) + step // 2) // step).astype(np.uint8)
+
+
+def _difference(colour: NDArray[np.uint8], known: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    return np.clip(colour.astype(np.int16) - known + _MIDDLE, 0, 255).astype(np.uint8)
+
+
+def _decompressed(section: str, data: bytes, size: int) -> bytes:
+    """``size`` bytes of a zstd frame; one that declares another size is refused before anything is allocated."""
+    try:
+        declared = zstandard.get_frame_parameters(data).content_size
+        if declared != size:
+            raise WireError(f"{section}: declares {declared} bytes, expected {size}")
+        out = zstandard.ZstdDecompressor().decompress(data, max_output_size=size, allow_extra_data=False)
+    except zstandard.ZstdError as error:
+        raise WireError(f"{section}: {error}") from error
+    if len(out) != size:
+        raise WireError(f"{section}: {len(out)} bytes, expected {size}")
+    return bytes(out)
+
+
+def _decode_png(data: bytes, height: int, width: int) -> NDArray[np.uint8]:
+    """Map (height, width) of a PNG, whose size, in its first chunk, is checked before it is decoded."""
+    head = width.to_bytes(4, "big") + height.to_bytes(4, "big") + bytes([8, 0, 0, 0, 0])  # 8 bits of grey, in order
+    if data[:8] != _PNG_START or data[12:16] != b"IHDR" or data[16:29] != head:
+        raise WireError(f"radius: not a grey PNG of {width}×{height}")
+    position = len(_PNG_START)
+    while position < len(data):
+        if data[position + 4 : position + 8] not in _PNG_CHUNKS:
+            raise WireError("radius: PNG chunk where our encoder writes none")
+        position += 12 + int.from_bytes(data[position : position + 4], "big")
+    try:
+        radius = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    except cv2.error as error:
+        raise WireError(f"radius: {error}") from error
+    if radius is None or radius.shape != (height, width) or radius.dtype != np.uint8:
+        raise WireError("radius: corrupt PNG")
+    return np.asarray(radius, np.uint8)
+
+
+def _jpeg_settings(quality: int) -> list[int]:
+    sampling = [cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_420]
+    return [cv2.IMWRITE_JPEG_QUALITY, quality, *sampling]
+
+
+@lru_cache(maxsize=64)
+def _jpeg_start(height: int, width: int, quality: int) -> bytes:
+    """All of a JPEG before its scan's data: the standard's tables, the size, the order of components."""
+    _, jpeg = cv2.imencode(".jpg", np.zeros((height, width, 3), np.uint8), _jpeg_settings(quality))
+    data, position = jpeg.tobytes(), 2
+    while True:
+        marker = data[position : position + 2]
+        position += 2 + int.from_bytes(data[position + 2 : position + 4], "big")
+        if marker == _START_OF_SCAN:
+            return bytes(data[:position])
+
+
+def _decode_colour(scan: bytes, height: int, width: int, quality: int) -> NDArray[np.uint8]:
+    if scan.count(b"\xff") != scan.count(b"\xff\x00"):  # in a scan, 0 follows every 255 that is no marker
+        raise WireError("colour: a marker within the scan")
+    data = _jpeg_start(height, width, quality) + scan + _END
+    try:
+        colour = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR_RGB)
+    except cv2.error as error:
+        raise WireError(f"colour: {error}") from error
+    if colour is None or colour.shape != (height, width, 3):
+        raise WireError("colour: corrupt JPEG")
+    return np.ascontiguousarray(colour, np.uint8)
+
+
+@njit(nogil=True, cache=True)
+def _fill(values, full, start, out):  # type: ignore[no-untyped-def]
+    """Copies ``values`` (H, W, C) to ``out``; an empty cell gets the mean of its block's full ones, a block without any
+    that of the block before it: no difference to it, which costs a JPEG one bit."""
+    height, width, channels = values.shape
+    mean = start.copy()
+    sums = np.zeros(channels, np.int64)
+    for top in range(0, height, BLOCK):
+        for left in range(0, width, BLOCK):
+            count = 0
+            sums[:] = 0
+            for v in range(top, min(top + BLOCK, height)):
+                for u in range(left, min(left + BLOCK, width)):
+                    if full[v, u]:
+                        count += 1
+                        for c in range(channels):
+                            sums[c] += values[v, u, c]
+            if count:
+                for c in range(channels):
+                    mean[c] = sums[c] // count
+            for v in range(top, min(top + BLOCK, height)):
+                for u in range(left, min(left + BLOCK, width)):
+                    for c in range(channels):
+                        out[v, u, c] = values[v, u, c] if full[v, u] else mean[c]
+
+
+@njit(nogil=True, cache=True)
+def _full_in_grids(places, full):  # type: ignore[no-untyped-def]
+    count = 0
+    for link in range(len(places)):
+        top, left, rows, columns = places[link]
+        for v in range(top, top + rows):
+            for u in range(left, left + columns):
+                count += full[v, u]
+    return count
+
+
+@njit(nogil=True, cache=True)
+def _expected(values, v, u, top, left):  # type: ignore[no-untyped-def]
+    """A cell's value as those before it in its link's grid, ``values`` from (top, left), let expect."""
+    if v == top:
+        return np.int64(values[v, u - 1]) if u > left else np.int64(0)
+    above = np.int64(values[v - 1, u])
+    if u == left:
+        return above
+    before, corner = np.int64(values[v, u - 1]), np.int64(values[v - 1, u - 1])
+    low, high = min(before, above), max(before, above)
+    return min(max(before + above - corner, low), high)
+
+
+@njit(nogil=True, cache=True)
+def _take_off(places, full, values, unexpected):  # type: ignore[no-untyped-def]
+    """What full cells' ``values`` are beyond what was to be expected, modulo 256; empty ones become as expected."""
+    n = 0
+    for link in range(len(places)):
+        top, left, rows, columns = places[link]
+        for v in range(top, top + rows):
+            for u in range(left, left + columns):
+                expected = _expected(values, v, u, top, left)
+                if full[v, u]:
+                    unexpected[n] = np.uint8((np.int64(values[v, u]) - expected) & 255)
+                    n += 1
+                else:
+                    values[v, u] = np.uint8(expected)
+
+
+@njit(nogil=True, cache=True)
+def _put_back(places, full, unexpected, values):  # type: ignore[no-untyped-def]
+    """``_take_off`` undone."""
+    n = 0
+    for link in range(len(places)):
+        top, left, rows, columns = places[link]
+        for v in range(top, top + rows):
+            for u in range(left, left + columns):
+                expected = _expected(values, v, u, top, left)
+                if full[v, u]:
+                    values[v, u] = np.uint8((expected + np.int64(unexpected[n])) & 255)
+                    n += 1
+                else:
+                    values[v, u] = np.uint8(expected)
