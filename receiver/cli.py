@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 import os
 import signal
 import sys
@@ -24,7 +25,19 @@ EXAMPLES = """examples:
   telepose-receive --window                           a desktop window besides the page
   telepose-receive --headless --log-shown shown.log   no page: render offscreen and keep what was shown
   telepose-receive export person.glb person.ply       the person whom a running receiver shows now, as files
+  telepose-receive decode monday.mcap monday.mp4      a session made by telepose-send encode, as a video (decode --help)
 """
+DECODE_EXAMPLES = """examples:
+  telepose-receive decode monday.mcap monday.mp4                      a video, from the front
+  telepose-receive decode monday.mcap side.mp4 --angle 90 --size 1280x720
+  telepose-receive decode monday.mcap pictures/                       000000.png, 000001.png, ... one for each frame
+  telepose-receive decode monday.mcap meshes/ --as ply                the moving person as coloured meshes
+  telepose-receive decode monday.mcap --page                          in the browser, over and over, at its own pace
+
+Sessions are MCAP files, and need the recording extra: pip install '.[recording]'. The same file gives the same
+pictures. Exit codes: 0 all of it was played, 1 nothing was, 3 it is damaged and was played up to the damage.
+"""
+OUT_KINDS = ("png", "ply", "glb")
 
 
 def parse_arguments(arguments: list[str] | None = None) -> argparse.Namespace:
@@ -72,6 +85,61 @@ def parse_export_arguments(arguments: list[str]) -> argparse.Namespace:
     return parser.parse_args(arguments)
 
 
+def parse_decode_arguments(arguments: list[str]) -> argparse.Namespace:
+    """What follows ``telepose-receive decode`` → ``session``, ``out`` or ``page``, and how."""
+    parser = argparse.ArgumentParser(
+        prog="telepose-receive decode",
+        description="Plays a session that telepose-send encode has stored: each skeleton moves the best mesh there is "
+        "by then, as a receiver would have shown it.",
+        epilog=DECODE_EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("session", type=Path, metavar="SESSION.mcap")
+    parser.add_argument("out", type=Path, nargs="?", metavar="OUT", help="a video (.mp4), or a new folder")
+    parser.add_argument("--as", dest="kind", choices=OUT_KINDS, default="png", help="files of a folder (default png)")
+    parser.add_argument("--rate", dest="rate_hz", type=_rate, metavar="HZ", help="frames (default: the recording's)")
+    parser.add_argument("--size", type=_size, default=(640, 480), metavar="WxH", help="pixels (default 640x480)")
+    parser.add_argument(
+        "--angle", dest="angle_deg", type=_angle, default=0.0, metavar="DEG", help="seen from there, 0: the front"
+    )
+    parser.add_argument("--page", action="store_true", help="play it in the browser page instead")
+    parser.add_argument("--once", action="store_true", help="with --page: end when it has been played")
+    parser.add_argument("--http-port", dest="http.port", type=int, metavar="PORT", help="with --page (default 8080)")
+    parser.add_argument("-c", "--config", type=Path, metavar="FILE", help="settings, TOML (see deploy/receiver.toml)")
+    options = parser.parse_args(arguments)
+    if options.page == (options.out is not None):
+        parser.error("name a file or folder to write, or --page")
+    return options
+
+
+def _rate(text: str) -> float:
+    return _number(text, 1, 240, "a rate in Hz")
+
+
+def _angle(text: str) -> float:
+    return _number(text, -360, 360, "an angle in degrees")
+
+
+def _size(text: str) -> tuple[int, int]:
+    width, _, height = text.partition("x")
+    if not (width.isascii() and width.isdigit() and height.isascii() and height.isdigit()):
+        raise argparse.ArgumentTypeError(f"{text!r} is not a size, such as 640x480")
+    size = int(width), int(height)
+    if not all(64 <= side <= 4096 and side % 2 == 0 for side in size):
+        raise argparse.ArgumentTypeError(f"{text!r}: sides must be even, from 64 to 4096")
+    return size
+
+
+def _number(text: str, low: float, high: float, what: str) -> float:
+    try:
+        number = float(text)
+    except ValueError:
+        number = math.nan
+    if not low <= number <= high:
+        raise argparse.ArgumentTypeError(f"{text!r} is not {what} from {low:g} to {high:g}")
+    return number
+
+
 def _export_file(text: str) -> Path:
     if Path(text).suffix.lower() not in EXPORT_SUFFIXES:
         raise argparse.ArgumentTypeError(f"{text!r} does not end in {' or '.join(EXPORT_SUFFIXES)}")
@@ -111,8 +179,32 @@ def run_export(arguments: list[str]) -> None:
         sys.exit(f"telepose-receive export: {error}")
 
 
+def run_decode(arguments: list[str]) -> int:
+    """``telepose-receive decode``: the exit code; a sentence and 1 where it cannot."""
+    options = parse_decode_arguments(arguments)
+    set_up_logging("INFO" if options.page else "WARNING")
+    prepare_threads()
+    port = getattr(options, "http.port")
+    given: dict[str, object] = {} if port is None else {"http.port": port}
+    from receiver.decode import DecodeError, DecodeOptions, decode  # numba and OpenCV take a second: not for --help
+
+    try:
+        settings = load_settings(ReceiverSettings, options.config, given)
+        if options.page:
+            from receiver.session_page import SessionPage
+
+            page = SessionPage(settings, options.session, options.once)
+            leave(run_daemon("telepose-receive decode", page.run))
+        what = options.session, options.out, options.kind, options.rate_hz, *options.size, options.angle_deg
+        return decode(settings, DecodeOptions(*what), print)
+    except (SettingsError, DecodeError) as error:
+        sys.exit(f"telepose-receive decode: {error}")
+
+
 def main() -> None:
     """Entry point of the console script."""
+    if sys.argv[1:2] == ["decode"]:
+        sys.exit(run_decode(sys.argv[2:]))
     if sys.argv[1:2] == ["export"]:
         return run_export(sys.argv[2:])
     options = parse_arguments()

@@ -19,7 +19,19 @@ EXAMPLES = """examples:
   telepose-send --self-view                           and a page of one's own: http://127.0.0.1:8081/
   telepose-send --recording DIR                       a recording (its format: docs/recordings.md)
   telepose-send --data DIR --body NAME --motion ID    a body and a motion clip of your own
+  telepose-send encode DIR OUT.mcap                   a recording into one small file, without a network (encode --help)
 """
+ENCODE_EXAMPLES = """examples:
+  telepose-send encode recordings/monday monday.mcap             what a link of 4 Mbit/s would carry
+  telepose-send encode recordings/monday thin.mcap --mbit 0.5    a smaller file: fewer and coarser meshes
+  telepose-send encode walk.jsonl walk.mcap --no-poses           skeletons alone: 7.5 KB/s
+  telepose-receive decode monday.mcap monday.mp4                 and back: as a video (decode --help)
+
+The file holds what would go over the network, as it would at that bandwidth: the same recording and settings give the
+same file. It is an MCAP file (https://mcap.dev), and needs the recording extra: pip install '.[recording]'.
+Ctrl-C ends early and keeps what there is.
+"""
+LEAST_MBIT, MOST_MBIT = 0.1, 10_000.0
 
 
 def parse_arguments(arguments: list[str] | None = None) -> argparse.Namespace:
@@ -64,6 +76,71 @@ def parse_arguments(arguments: list[str] | None = None) -> argparse.Namespace:
     return parser.parse_args(arguments)
 
 
+def parse_encode_arguments(arguments: list[str]) -> argparse.Namespace:
+    """What follows ``telepose-send encode`` → ``recording``, ``file``, ``mbit``, ``seconds``, and settings by key."""
+    parser = argparse.ArgumentParser(
+        prog="telepose-send encode",
+        description="Stores a recording as a receiver would get it: a skeleton of every frame, and meshes as the "
+        "bandwidth allows. Says what each takes, beside the raw images.",
+        epilog=ENCODE_EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("recording", type=Path, metavar="RECORDING", help="folder or file (docs/recordings.md)")
+    parser.add_argument("file", type=_session_file, metavar="OUT.mcap", help="the file to write; replaced when whole")
+    parser.add_argument(
+        "--mbit", type=_mbit, default=4.0, metavar="N", help="bandwidth in Mbit/s, skeletons included (default 4)"
+    )
+    parser.add_argument("--seconds", type=_seconds, metavar="S", help="only the first so many seconds")
+    parser.add_argument("-c", "--config", type=Path, metavar="FILE", help="settings, TOML (see deploy/sender.toml)")
+    parser.add_argument("--site", dest="site", metavar="NAME", help="the name in the file's keys (default: studio)")
+    parser.add_argument("--person", dest="person", type=int, metavar="N", help="which person of it (default: 0)")
+    parser.add_argument("--tracker", dest="tracking.tracker", metavar="NAME", help="as of telepose-send")
+    parser.add_argument(
+        "--no-poses", dest="poses.enabled", action="store_false", default=None, help="skeletons only, no meshes"
+    )
+    return parser.parse_args(arguments)
+
+
+def _session_file(text: str) -> Path:
+    if Path(text).suffix != ".mcap":
+        raise argparse.ArgumentTypeError(f"{text!r} does not end in .mcap")
+    return Path(text)
+
+
+def _mbit(text: str) -> float:
+    return _number(text, LEAST_MBIT, MOST_MBIT, "a bandwidth in Mbit/s")
+
+
+def _seconds(text: str) -> float:
+    return _number(text, 0.1, 1e6, "a time in seconds")
+
+
+def _number(text: str, low: float, high: float, what: str) -> float:
+    try:
+        number = float(text)
+    except ValueError:
+        number = -1.0
+    if not low <= number <= high:
+        raise argparse.ArgumentTypeError(f"{text!r} is not {what} from {low:g} to {high:g}")
+    return number
+
+
+def run_encode(arguments: list[str]) -> int:
+    """``telepose-send encode``: the exit code; a sentence and 1 where it cannot."""
+    options = vars(parse_encode_arguments(arguments))
+    recording, file, mbit, seconds = (options.pop(name) for name in ("recording", "file", "mbit", "seconds"))
+    given = {key: value for key, value in options.items() if key != "config" and value is not None}
+    set_up_logging("WARNING")
+    prepare_threads()
+    from sender.encode import EncodeError, EncodeOptions, encode  # numba and OpenCV take a second: not for --help
+
+    try:
+        settings = load_settings(SenderSettings, options["config"], given)
+        return encode(settings, EncodeOptions(recording, file, mbit, seconds), print)
+    except (SettingsError, EncodeError) as error:
+        sys.exit(f"telepose-send encode: {error}")
+
+
 def source_of(given: dict[str, object]) -> dict[str, object]:
     """Settings given on the command line, with the capture source that they imply."""
     if "capture.recording" in given:
@@ -73,6 +150,8 @@ def source_of(given: dict[str, object]) -> dict[str, object]:
 
 def main() -> None:
     """Entry point of the console script."""
+    if sys.argv[1:2] == ["encode"]:
+        sys.exit(run_encode(sys.argv[2:]))
     options = parse_arguments()
     set_up_logging(options.log_level)
     prepare_threads()

@@ -30,18 +30,15 @@ from sender.candidate_poses.mesh_scheduler import MeshScheduler, SendRecord
 from sender.capture.capture_thread import CaptureThread
 from sender.capture.frame_set import CaptureError, FrameSet, FrameSource
 from sender.capture.open_source import open_source
-from sender.capture.recorded_skeletons import RecordedSkeletons
-from sender.capture.synchronizer import Synchronizer
 from sender.capture.virtual_rig import VirtualRig
 from sender.channels_out import SenderChannels
 from sender.config import SenderSettings
 from sender.fitting.body_model import BodyModel
 from sender.fitting.open_tracker import ignored_settings, open_tracker
-from sender.fitting.outside_tracker import OutsideTracker
 from sender.fitting.particle_weights_opencl import OpenClUnavailable
-from sender.pipeline import CandidatePath, Candidates, SkeletonPath, StreamIdentity, TrackedFrame
+from sender.open_path import open_skeleton_path, open_synchronizer, outside_tracker
+from sender.pipeline import CandidatePath, Candidates, StreamIdentity, TrackedFrame
 from sender.receiver_links import ReceiverLinks
-from sender.reconstruction.person_points import DepthReconstruction, HullReconstruction
 from sender.rehearsal import rehearse_all, rehearse_candidates
 from sender.self_view import SelfView, open_self_view
 from sender.send_log import SendLog
@@ -159,8 +156,10 @@ class _Stream:
         for sentence in ignored_settings(settings.tracking.tracker, body, settings.tracking.weights):
             log.warning("tracker: %s", sentence)
         self._tracker = open_tracker(settings.tracking.tracker, body, settings.tracking.weights)
-        self._outside = _outside_tracker(source)
-        self._skeletons = self._skeleton_path(identity)
+        self._outside = outside_tracker(source)
+        self._skeletons = open_skeleton_path(
+            identity, source, settings.tracking, self._tracker, self._outside, self._timer, clock
+        )
         self._candidates = CandidatePath(identity, settings.poses, self._timer)
         self._scheduler = MeshScheduler()
         self._send_log = _open_send_log(settings.poses.send_log)
@@ -170,7 +169,7 @@ class _Stream:
         )
         self._fitting = ComputeWorker("fitting", self._fit, self._on_tracked)
         self._meshing = ComputeWorker("candidates", self._make_candidate, self._on_candidates, background=True)
-        self._synchronizer = self._make_synchronizer()
+        self._synchronizer = open_synchronizer(source, settings.capture.patience_ms)
         hurried = settings.capture.source != "recording" or settings.capture.realtime
         deliver = self._fitting.submit if hurried else self._fitting.submit_in_turn
         self._capture = CaptureThread(source, self._synchronizer, deliver, clock)
@@ -188,28 +187,6 @@ class _Stream:
     def close(self) -> None:
         """Write out what is buffered."""
         self._send_log.close()
-
-    def _skeleton_path(self, identity: StreamIdentity) -> SkeletonPath:
-        source, settings = self._source, self._settings
-        given = source.cameras, source.empty_room, settings.tracking.points
-        inside = settings.tracking.tracker == "particles"
-        return SkeletonPath(
-            identity,
-            DepthReconstruction(*given) if source.has_depth else HullReconstruction(*given, inside),
-            self._tracker,
-            source.frame_rate_hz,
-            self._timer,
-            self._clock,
-            source.start_joints,
-            self._outside,
-        )
-
-    def _make_synchronizer(self) -> Synchronizer:
-        cameras = self._source.cameras
-        half_a_frame_ns = int(0.5e9 / self._source.frame_rate_hz)
-        patience_ns = int(self._settings.capture.patience_ms * 1e6)
-        shapes = [(camera.height, camera.width) for camera in cameras]
-        return Synchronizer(len(cameras), half_a_frame_ns, patience_ns, shapes)
 
     async def run(self, daemon: Daemon) -> None:
         """Capture, fit, publish until the source ends."""
@@ -342,10 +319,3 @@ def _open_send_log(file: Path | None) -> SendLog:
         return SendLog(file)
     except OSError as error:
         raise DaemonError(f"[poses] send_log: {error}") from error
-
-
-def _outside_tracker(source: FrameSource) -> OutsideTracker | None:
-    """For a source whose sensors track by themselves."""
-    if not isinstance(source, RecordedSkeletons):
-        return None
-    return OutsideTracker(source.recording.kind, source.recording.sensors)

@@ -16,6 +16,7 @@ from common.transport.channel_subscriber import Arrival
 from common.transport.channels import receiver_of
 from common.wire.receiver_report import decode_report
 from sender.candidate_poses.mesh_scheduler import MeshScheduler, SendRecord
+from sender.outgoing_bulk import OutgoingBulk
 
 log = logging.getLogger(__name__)
 
@@ -112,21 +113,15 @@ class ReceiverLinks:
         publisher = self._open_publisher(name)
         self._scheduler.receiver_joined(name, receiver_epoch)
 
+        choice = OutgoingBulk(name, self._scheduler, self._on_sent)
+
         def next_message(budget_bytes: int) -> BulkMessage | None:
-            now_ns = self._clock.now_ns()
-            chosen = self._scheduler.next_for(name, budget_bytes * 1_000_000_000 // PERIOD_NS, now_ns)
-            if chosen is None:
-                return None
-            pose_id, payload = chosen
-            record = self._scheduler.sent(name, pose_id, now_ns)  # the bulk sender sees it through
-            if record is None:
-                return None
-            self._on_sent(record)
-            return BulkMessage((pose_id, record.preview), payload)
+            chosen = choice.next_message(budget_bytes * 1_000_000_000 // PERIOD_NS, self._clock.now_ns())
+            return None if chosen is None else BulkMessage(*chosen)
 
         def delivered(message: Hashable) -> None:
             self.delivered_poses += 1
-            log.debug("pose %s delivered to %s", message, name)
+            log.debug("%s delivered to %s", message, name)
 
         bulk = BulkSender(publisher, BulkWindow(self._epoch), self._epoch, next_message, delivered, self._clock)
         task = self._group.create_task(bulk.run(), name=f"bulk to {name}")

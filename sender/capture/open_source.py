@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 from sender.capture.frame_set import FrameSource
 from sender.capture.recorded_rig import RecordedRig
 from sender.capture.recorded_skeletons import RecordedSkeletons
@@ -19,9 +21,7 @@ def open_source(settings: CaptureSettings) -> FrameSource:
     """
     if settings.source == "recording":
         assert settings.recording is not None  # the settings were checked
-        if settings.recording.suffix in SUFFIXES:
-            return RecordedSkeletons.open(settings.recording, settings.realtime, settings.loop)
-        return RecordedRig.open(settings.recording, settings.realtime, settings.loop)
+        return open_player(settings.recording, settings.realtime, settings.loop)
     if settings.source == "rig":
         assert settings.rig_socket is not None
         return VirtualRig.attach(settings.rig_socket, settings.depth)
@@ -39,3 +39,16 @@ def open_source(settings: CaptureSettings) -> FrameSource:
         ),
         settings.depth,
     )
+
+
+def open_player(
+    recording: Path, realtime: bool, loop: bool = False, start_ns: int | None = None
+) -> RecordedRig | RecordedSkeletons:
+    """The recording at a path, of whatever kind; the rest as in ``RecordedRig``.
+
+    Raises:
+        CaptureError: there is none, or it is malformed.
+    """
+    if recording.suffix in SUFFIXES:
+        return RecordedSkeletons.open(recording, realtime, loop, start_ns)
+    return RecordedRig.open(recording, realtime, loop, start_ns)

@@ -69,26 +69,28 @@ class RecordedRig:
     """Plays a recording.
 
     ``realtime``: frames come at the times at which they were taken, counted from the first ``read``; otherwise as fast
-    as they are read, with the capture times they would have had. ``loop``: start again at the end. Frames that cannot
-    be decoded are left out; ``dropped`` counts them and ``last_error`` says why. Not thread-safe: close it when no
-    thread is reading any more.
+    as they are read, with the capture times they would have had. ``start_ns``: time 0 of the capture times, without it
+    the first ``read``. ``loop``: start again at the end. Frames that cannot be decoded are left out; ``dropped`` counts
+    them and ``last_error`` says why. Not thread-safe: close it when no thread is reading any more.
     """
 
-    def __init__(self, recording: Recording, realtime: bool = True, loop: bool = False) -> None:
+    def __init__(
+        self, recording: Recording, realtime: bool = True, loop: bool = False, start_ns: int | None = None
+    ) -> None:
         self._recording = recording
         self._realtime = realtime
         self._decoders = ThreadPoolExecutor(_DECODERS, thread_name_prefix="decoder")
         self._schedule = self._in_order(loop)
         self._decoding: deque[tuple[int, int, int, Future[Images]]] = deque()
-        self._start_ns: int | None = None
+        self._start_ns = start_ns
         self.dropped = 0
         self.last_error = ""
         self._decode_ahead()
 
     @classmethod
-    def open(cls, path: Path, realtime: bool = True, loop: bool = False) -> RecordedRig:
+    def open(cls, path: Path, realtime: bool = True, loop: bool = False, start_ns: int | None = None) -> RecordedRig:
         """The recording at ``path``; raises CaptureError as ``open_recording`` does."""
-        return cls(open_recording(path), realtime, loop)
+        return cls(open_recording(path), realtime, loop, start_ns)
 
     @property
     def cameras(self) -> tuple[Camera, ...]:
@@ -114,6 +116,11 @@ class RecordedRig:
     def epoch_ns(self) -> int | None:
         """The recording's time 0 on the clock of the capture times; None before the first ``read``."""
         return self._start_ns
+
+    @property
+    def duration_ns(self) -> int:
+        """From the first frame to the last, played once."""
+        return self._recording.frames[-1][0]
 
     def read(self, timeout_s: float) -> Frame | None:
         """The next frame, or None when none is due in time.

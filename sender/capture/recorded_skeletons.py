@@ -18,30 +18,39 @@ from sender.capture.skeleton_recording import open_skeleton_recording
 
 
 class RecordedSkeletons:
-    """Plays a recording of skeletons; ``realtime`` and ``loop`` as in ``RecordedRig``."""
+    """Plays a recording of skeletons; ``realtime``, ``loop`` and ``start_ns`` as in ``RecordedRig``."""
 
     cameras: tuple[Camera, ...] = ()
     empty_room: tuple[NDArray[np.uint16] | None, ...] = ()
     start_joints: NDArray[np.floating] | None = None
     has_depth = False
 
-    def __init__(self, recording: SkeletonRecording, realtime: bool = True, loop: bool = False) -> None:
+    def __init__(
+        self, recording: SkeletonRecording, realtime: bool = True, loop: bool = False, start_ns: int | None = None
+    ) -> None:
         self.recording = recording
         self.frame_rate_hz = recording.frame_rate_hz
         self._realtime = realtime
         self._schedule = _in_order(recording, loop)
         self._next = next(self._schedule, None)
-        self._start_ns: int | None = None
+        self._start_ns = start_ns
 
     @classmethod
-    def open(cls, path: Path, realtime: bool = True, loop: bool = False) -> RecordedSkeletons:
+    def open(
+        cls, path: Path, realtime: bool = True, loop: bool = False, start_ns: int | None = None
+    ) -> RecordedSkeletons:
         """The recording at ``path``; raises CaptureError as ``open_skeleton_recording`` does."""
-        return cls(open_skeleton_recording(path), realtime, loop)
+        return cls(open_skeleton_recording(path), realtime, loop, start_ns)
 
     @property
     def epoch_ns(self) -> int | None:
         """The recording's time 0 on the clock of the capture times; None before the first ``read``."""
         return self._start_ns
+
+    @property
+    def duration_ns(self) -> int:
+        """From the first instant to the last, played once."""
+        return max(skeleton.capture_ns for skeleton in self.recording.instants[-1])
 
     def read(self, timeout_s: float) -> FrameSet | None:
         """The next instant, or None when none is due in time.

@@ -1,0 +1,112 @@
+"""Messages of a session in, what to show out: the receiver in virtual time, where thinking takes none. Pure.
+
+The same stream, meshes, choice and animation as the daemon's; the same file gives the same pictures.
+"""
+
+from __future__ import annotations
+
+from collections import Counter, deque
+from collections.abc import Iterable, Iterator
+
+from common.runtime.clock import ManualClock
+from common.runtime.session_recording import StoredMessage
+from common.runtime.stage_timer import StageTimer
+from common.transport import channels
+from common.transport.chunks import decode_chunk
+from common.wire.header import WireError
+from receiver.config import RepositorySettings
+from receiver.incoming_stream import IncomingStream
+from receiver.pipeline import AnimationPath, ReceivedPose, Shown, SkeletonToShow, mesh_of
+from receiver.viewer.viewer import Viewer
+
+MESHES_WAITING = 8  # for the next skeleton, as in the daemon
+SILENCE_NS = 10_000_000_000  # a gap between two messages that is longer is not played
+
+
+class SessionPlayer:
+    """Plays the stream of ``person``. ``counts``: messages by what became of them; ``last_error``: of a refused one;
+    ``payload_bytes``: by channel."""
+
+    def __init__(self, settings: RepositorySettings, person: int) -> None:
+        self.counts: Counter[str] = Counter()
+        self.payload_bytes: Counter[str] = Counter()
+        self.last_error = ""
+        self._settings = settings
+        self._person = person
+        self._stream = IncomingStream(person)
+        clock = ManualClock()
+        self._animation = AnimationPath(settings, StageTimer(clock), clock)
+        self._arrived: deque[ReceivedPose] = deque(maxlen=MESHES_WAITING)
+
+    def take(self, message: StoredMessage) -> Shown | None:
+        """Take in the next message; what a skeleton leads to. What is malformed is counted and changes nothing."""
+        channel = _channel_of(message.key, self._person)
+        self.payload_bytes[channel] += len(message.payload)
+        try:
+            if channel == channels.SKELETON.name:
+                return self._take_skeleton(message)
+            if channel == channels.BODY.name:
+                self._stream.body(message.payload)
+            elif channel == channels.BULK.name:
+                self._take_chunk(message.payload)
+            else:
+                self.counts["of no interest"] += 1
+        except WireError as error:
+            self.counts["refused"] += 1
+            self.last_error = str(error)
+        return None
+
+    def _take_skeleton(self, message: StoredMessage) -> Shown | None:
+        newest = self._stream.skeleton(message.payload, message.time_ns)
+        if newest is None or newest.body is None:
+            self.counts["skeleton not shown"] += 1
+            return None
+        self.counts["shown"] += 1
+        return self._animation.show(SkeletonToShow(newest.packet, newest.body, self._arrived))
+
+    def _take_chunk(self, payload: bytes) -> None:
+        whole = self._stream.chunk(decode_chunk(payload))
+        if whole is not None:
+            self.counts["pose waiting too long"] += len(self._arrived) == MESHES_WAITING
+            self._arrived.append(mesh_of(whole, self._person, self._settings.score_form))
+            self.counts["poses"] += 1
+
+
+def _channel_of(key: str, person: int) -> str:
+    """The channel's name in a key of this person's, whatever the site; "" in others."""
+    parts = key.split("/")
+    return parts[3] if len(parts) >= 4 and parts[2] == str(person) else ""
+
+
+def put_on(viewer: Viewer, shown: Shown) -> None:
+    """Tell a viewer what a skeleton led to."""
+    for pose_id in shown.removed:
+        viewer.remove_pose(pose_id)
+    for mesh in shown.added:
+        viewer.add_pose(mesh)
+    viewer.show(shown.frame)
+
+
+def display_ticks(
+    messages: Iterable[StoredMessage], player: SessionPlayer, viewer: Viewer, rate_hz: float
+) -> Iterator[int]:
+    """Plays all messages to ``viewer`` and stops at every display tick: the number of the tick, from 0 on."""
+    tick, begin_ns, now_ns = 0, None, 0
+    for message in messages:
+        now_ns = max(now_ns, message.time_ns)
+        begin_ns = now_ns if begin_ns is None else begin_ns
+        if now_ns - begin_ns - _tick_ns(tick, rate_hz) > SILENCE_NS:
+            begin_ns = now_ns - _tick_ns(tick, rate_hz)
+        while now_ns - begin_ns > _tick_ns(tick, rate_hz):
+            yield tick
+            tick += 1
+        shown = player.take(message)
+        if shown is not None:
+            put_on(viewer, shown)
+    if begin_ns is not None:
+        yield tick
+
+
+def _tick_ns(tick: int, rate_hz: float) -> int:
+    """Half a period after the tick's frame was captured, so that rounding decides nothing."""
+    return int((tick + 0.5) * 1e9 / rate_hz)
