@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 from common.body.skeleton import Skeleton
 from common.runtime.clock import Clock
@@ -17,16 +17,15 @@ from common.transport.channel_publisher import ChannelPublisher
 from common.transport.channel_query import ask
 from common.transport.channel_subscriber import Arrival, ChannelSubscriber
 from common.transport.channels import Channel, channel_key
-from common.transport.chunks import ChunkAssembler, decode_chunk
+from common.transport.chunks import decode_chunk
 from common.transport.clock_exchange import exchange_times
 from common.transport.clock_offset import ClockOffset
 from common.transport.reception import Reception
 from common.transport.zenoh_session import ZenohSession
-from common.wire.body_message import decode_body
 from common.wire.header import WireError
 from common.wire.receiver_report import encode_report
-from common.wire.skeleton_packet import SkeletonPacket, decode_skeleton
-from receiver.skeleton_buffer import SkeletonBuffer
+from common.wire.skeleton_packet import SkeletonPacket
+from receiver.incoming_stream import IncomingStream
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,32 +40,21 @@ class Handlers:
     presence: Callable[[bool], None]
 
 
-@dataclass(slots=True)
-class _Bodies:
-    """Sizes by revision, of one sender epoch."""
-
-    epoch: int | None = None
-    by_revision: dict[int, Skeleton] = field(default_factory=dict)
-    newest_revision: int | None = None
-
-
 class ReceiverChannels:
-    """One person's incoming stream."""
+    """One person's incoming stream. ``counts``: answers to questions that were malformed."""
 
     def __init__(
         self, session: ZenohSession, site: str, person: int, name: str, receiver_id: int, epoch: int, clock: Clock
     ) -> None:
         self.counts: Counter[str] = Counter()
         self.clock_offset = ClockOffset()
-        self.skeletons = SkeletonBuffer()
-        self.assembler = ChunkAssembler()
+        self.stream = IncomingStream(person)
         self.subscribers: dict[str, ChannelSubscriber] = {}
         self._session = session
         self._site, self._person, self._name = site, person, name
         self._clock = clock
         self._reception = Reception(receiver_id, epoch)
         self.first_skeleton_ns: int | None = None  # when the very first one arrived
-        self._bodies = _Bodies()
         self._report = ChannelPublisher(session, channels.REPORT, self._key(channels.REPORT, name))
         self._handlers: Handlers | None = None
 
@@ -91,7 +79,7 @@ class ReceiverChannels:
     def send_report(self, repository_poses: int) -> None:
         """Tell the sender's bulk window how things are."""
         now_ns = self._clock.now_ns()
-        report = self._reception.report(now_ns, self._bodies.newest_revision, repository_poses)
+        report = self._reception.report(now_ns, self.stream.body_revision, repository_poses)
         self._report.put(encode_report(report))
 
     async def ask_time(self) -> None:
@@ -106,59 +94,40 @@ class ReceiverChannels:
             except WireError:
                 self.counts["body malformed"] += 1
 
-    @property
-    def lacks_body(self) -> bool:
-        """A skeleton came whose body has not."""
-        newest = self.skeletons.newest
-        return newest is not None and not self._knows(newest)
-
     def age_ns(self, capture_ns: int, now_ns: int) -> int | None:
         """How long ago a capture time of the sender was, by our clock; None while its offset is unknown."""
         return now_ns - self.clock_offset.to_local_ns(capture_ns, now_ns) if self.clock_offset.known else None
 
     def _on_skeleton(self, arrival: Arrival) -> None:
         assert self._handlers is not None
-        packet = decode_skeleton(arrival.payload)
-        before = self.skeletons.newest
-        if packet.person != self._person:
-            raise WireError(f"skeleton of person {packet.person} under person {self._person}'s key")
-        if not self.skeletons.push(packet, arrival.arrival_ns):
+        newest = self.stream.skeleton(arrival.payload, arrival.arrival_ns)
+        if newest is None:
             return
-        if before is not None and before.epoch != packet.epoch:
+        if newest.new_epoch:
             self.clock_offset.forget()
             self._handlers.epoch()
         if self.first_skeleton_ns is None:
             self.first_skeleton_ns = arrival.arrival_ns
+        packet = newest.packet
         self._reception.skeleton(packet.epoch, packet.send_ns, arrival.arrival_ns)
-        if self._knows(packet):
-            self._handlers.skeleton(packet, self._bodies.by_revision[packet.body_revision], arrival.payload)
-        else:
-            self.counts["body unknown"] += 1
+        if newest.body is not None:
+            self._handlers.skeleton(packet, newest.body, arrival.payload)
 
     def _on_body(self, arrival: Arrival) -> None:
         self._take_body(arrival.payload)
 
     def _take_body(self, data: bytes) -> None:
         assert self._handlers is not None
-        message = decode_body(data)
-        if message.person != self._person:
-            raise WireError(f"body of person {message.person} under person {self._person}'s key")
-        if message.epoch != self._bodies.epoch:
-            self._bodies = _Bodies(message.epoch)
-        self._bodies.by_revision[message.revision] = message.skeleton
-        self._bodies.newest_revision = message.revision
+        self.stream.body(data)
         self._handlers.body(data)
 
     def _on_chunk(self, arrival: Arrival) -> None:
         assert self._handlers is not None
         chunk = decode_chunk(arrival.payload)
-        message = self.assembler.push(chunk)
+        message = self.stream.chunk(chunk)
         self._reception.chunk(chunk, len(arrival.payload), arrival.arrival_ns)
         if message is not None:
             self._handlers.pose(message)
-
-    def _knows(self, packet: SkeletonPacket) -> bool:
-        return packet.epoch == self._bodies.epoch and packet.body_revision in self._bodies.by_revision
 
     def _key(self, channel: Channel, receiver: str | None = None) -> str:
         return channel_key(channel, self._site, self._person, receiver)

@@ -249,7 +249,7 @@ class _Show:
         """Ask for the sizes that newly arrived skeletons refer to, when they were published before we came."""
         while True:
             await asyncio.sleep(BODY_PERIOD_S)
-            if self._channels.lacks_body:
+            if self._channels.stream.lacks_body:
                 await self._channels.ask_body()
 
     async def _every(self, period_s: float, action: Callable[[], None]) -> None:
@@ -268,7 +268,7 @@ class _Show:
     def _make_metrics(self) -> Metrics:
         metrics = Metrics()
         metrics.stages(self._timer)
-        skeletons = self._channels.skeletons.counts
+        skeletons = self._channels.stream.skeletons.counts
         metrics.counter("skeletons_received_total", "Skeletons that were the newest", lambda: skeletons["accepted"])
         metrics.counter("skeletons_lost_total", "Gaps in the sequence", lambda: skeletons["lost"])
         metrics.counter("frames_shown_total", "Frames given to the viewer", lambda: self._state.frames_shown)
@@ -280,20 +280,21 @@ class _Show:
 
     def _dropped(self) -> dict[str, float]:
         channels = self._channels
-        judged = {f"skeleton {cause}": channels.skeletons.counts[cause] for cause in
+        judged = {f"skeleton {cause}": channels.stream.skeletons.counts[cause] for cause in
                   ("stale", "duplicate", "old_epoch", "far_future", "lost")}  # fmt: skip
         refused = {
             f"{name} {cause}": count
             for name, subscriber in channels.subscribers.items()
             for cause, count in subscriber.counts.items()
         }
-        chunks = {f"chunk {cause}": count for cause, count in channels.assembler.counts.items()}
+        chunks = {f"chunk {cause}": count for cause, count in channels.stream.assembler.counts.items()}
         return {
             "animation busy": self._animation.dropped,
             **judged,
             **refused,
             **chunks,
             **channels.counts,
+            **channels.stream.counts,
             **self._counts,
         }
 
@@ -307,7 +308,7 @@ class _Show:
         rendered = self.viewer.frames_rendered if isinstance(self.viewer, HeadlessScreen) else None
         return self._statistics.figures() | {
             "settings": dump_settings(self._settings),
-            "skeletons_received": self._channels.skeletons.counts["accepted"],
+            "skeletons_received": self._channels.stream.skeletons.counts["accepted"],
             "frames_shown": self._state.frames_shown,
             "frames_rendered": self._state.frames_shown if rendered is None else rendered,
             "time_to_first_body_s": self._time_to_first_body_s(),

@@ -14,6 +14,7 @@ from pathlib import Path
 
 from common.runtime.clock import MonotonicClock
 from common.runtime.daemon import Daemon, DaemonError
+from common.runtime.http_access import read_token, tls_context
 from common.runtime.metrics import Health, Metrics, daemon_app, serve_app
 from common.runtime.session_recording import RecordingError, SessionReader
 from common.transport.channels import SCHEMA
@@ -60,13 +61,13 @@ class SessionPage:
         Raises:
             DaemonError: the session cannot be played, or the port not be had.
         """
-        health = Health(ready=True, reason="playing")
-        app = daemon_app(Metrics(), health)
-        self._viewer.add_routes(app)
         http = self._settings.http
+        app = daemon_app(Metrics(), Health(ready=True, reason="playing"), read_token(http))
+        tls = tls_context(http)
+        self._viewer.add_routes(app)
         try:
-            async with serve_app(app, http.host, http.port) as port:
-                log.info("the page on http://%s:%d/", http.host, port)
+            async with serve_app(app, http.host, http.port, tls) as port:
+                log.info("the page on %s://%s:%d/", "https" if tls else "http", http.host, port)
                 daemon.announce_ready()
                 told = False
                 while not (told and self._once):

@@ -86,22 +86,22 @@ async def until(condition: Callable[[], object], limit_s: float = 10.0) -> None:
 async def test_a_skeleton_is_handed_on_once_its_body_is_known():
     async with ends() as both:
         both.sender.publish_skeleton(packet(0))
-        await until(lambda: both.receiver.counts["body unknown"] == 1)
-        assert both.receiver.lacks_body
+        await until(lambda: both.receiver.stream.counts["body unknown"] == 1)
+        assert both.receiver.stream.lacks_body
         both.sender.publish_body(body())
         await until(lambda: both.heard["body"])
         both.sender.publish_skeleton(packet(1))
         await until(lambda: both.heard["skeleton"] == [1])
-        assert not both.receiver.lacks_body
+        assert not both.receiver.stream.lacks_body
 
 
 async def test_a_late_receiver_asks_for_the_body():
     async with ends() as both:
         both.sender._body_message = body()  # published before anyone listened
         both.sender.publish_skeleton(packet(0))
-        await until(lambda: both.receiver.lacks_body)
+        await until(lambda: both.receiver.stream.lacks_body)
         await both.receiver.ask_body()
-        assert not both.receiver.lacks_body
+        assert not both.receiver.stream.lacks_body
 
 
 async def test_a_new_run_is_told_and_forgets_the_old_clock():
@@ -149,7 +149,7 @@ async def test_bytes_that_are_no_skeleton_are_counted_and_change_nothing(payload
     async with ends() as both:
         both.raw(channels.SKELETON, payload)
         await until(lambda: both.receiver.subscribers["skeleton"].counts["malformed"] == 1)
-        assert both.receiver.skeletons.newest is None
+        assert both.receiver.stream.skeletons.newest is None
 
 
 async def test_junk_on_every_channel_is_counted():

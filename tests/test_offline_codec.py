@@ -12,6 +12,7 @@ import pytest
 
 from common.geometry.rasterizer import render
 from common.runtime.daemon import Daemon
+from common.runtime.http_access import HttpSettings
 from common.runtime.session_recording import SessionReader, SessionWriter
 from common.transport.channels import CHANNELS
 from common.wire.skeleton_packet import decode_skeleton
@@ -180,7 +181,7 @@ def test_the_command_lines_say_what_is_wrong(recording, session, tmp_path, capsy
 
 async def test_a_session_plays_in_the_page(session):
     port = free_port()
-    settings = ReceiverSettings(http=ReceiverSettings().http.__class__(port=port))
+    settings = ReceiverSettings(http=HttpSettings(port=port))
     playing = asyncio.create_task(SessionPage(settings, session, once=True).run(Daemon("test", None)))
     sequences = []
     async with asyncio.timeout(30):
