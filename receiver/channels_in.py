@@ -7,7 +7,7 @@ is made of it.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 from common.body.skeleton import Skeleton
@@ -24,6 +24,7 @@ from common.transport.reception import Reception
 from common.transport.zenoh_session import ZenohSession
 from common.wire.header import WireError
 from common.wire.receiver_report import encode_report
+from common.wire.repository_list import RepositoryList, decode_repository_list, encode_repository_list
 from common.wire.skeleton_packet import SkeletonPacket
 from receiver.incoming_stream import IncomingStream
 
@@ -53,6 +54,7 @@ class ReceiverChannels:
         self._session = session
         self._site, self._person, self._name = site, person, name
         self._clock = clock
+        self._epoch = epoch
         self._reception = Reception(receiver_id, epoch)
         self.first_skeleton_ns: int | None = None  # when the very first one arrived
         self._report = ChannelPublisher(session, channels.REPORT, self._key(channels.REPORT, name))
@@ -93,6 +95,25 @@ class ReceiverChannels:
                 self._take_body(answer)
             except WireError:
                 self.counts["body malformed"] += 1
+
+    async def ask_repository(self, epoch: int, holding: Mapping[int, int]) -> dict[int, int] | None:
+        """Tell the sender the candidate poses held of its run ``epoch``, bytes by id, and ask for its own; None while
+        there is no answer."""
+        newest = self.stream.skeletons.newest
+        if newest is None:
+            return None
+        mine = holding if epoch == newest.epoch else {}
+        told = encode_repository_list(RepositoryList(newest.epoch, self._epoch, mine))
+        key = self._key(channels.REPOSITORY, self._name)
+        for answer in await ask(self._session, channels.REPOSITORY, key, told):
+            try:
+                theirs = decode_repository_list(answer)
+            except WireError:
+                self.counts["repository list malformed"] += 1
+                continue
+            if (theirs.sender_epoch, theirs.receiver_epoch) == (newest.epoch, self._epoch):
+                return dict(theirs.poses)
+        return None
 
     def age_ns(self, capture_ns: int, now_ns: int) -> int | None:
         """How long ago a capture time of the sender was, by our clock; None while its offset is unknown."""

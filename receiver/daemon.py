@@ -29,6 +29,7 @@ from common.transport.access_rules import for_receiver, receiver_name
 from common.transport.link_settings import with_endpoints
 from common.transport.zenoh_session import ZenohSession, open_session, own_certificate
 from common.wire.header import WireError
+from common.wire.repository_list import REPOSITORY_LIST_MAX_POSES
 from common.wire.skeleton_packet import SkeletonPacket
 from receiver.channels_in import Handlers, ReceiverChannels
 from receiver.config import ReceiverSettings
@@ -110,6 +111,9 @@ class _Show:
         self._animation = ComputeWorker("animation", self._animation_path.show, self._on_shown, rehearse)
         self._mesher = ThreadPoolExecutor(1, "mesher", into_background)
         self._messages: asyncio.Queue[bytes] = asyncio.Queue(MESHES_WAITING)
+        self._held: tuple[int, dict[int, int]] = (-1, {})  # sender's run; bytes of the poses taken in, by id
+        self._offered_poses = 0
+        self._appeared = asyncio.Event()
         self._meshes: deque[ReceivedPose] = deque()  # meshed, waiting for the next skeleton; bounded in _mesh_poses
         self._newest: SkeletonToShow | None = None
         self._log = ShowLog(settings.shown_log) if settings.shown_log else None
@@ -124,7 +128,7 @@ class _Show:
     async def run(self, daemon: Daemon, page: str) -> None:
         """Receive and show until cancelled, or until the window on ``page`` is closed where there is one."""
         self._channels.open(
-            Handlers(self._on_skeleton, self._on_pose, self._on_body, self._on_epoch, self._state.presence)
+            Handlers(self._on_skeleton, self._on_pose, self._on_body, self._on_epoch, self._on_presence)
         )
         lasting: list[Coroutine[Any, Any, None]] = [
             self._animation.run(),
@@ -134,6 +138,7 @@ class _Show:
             self._every(1 / self._settings.view.display_hz, self._tick),
             self._keep_time(),
             self._keep_body(),
+            self._tell_what_is_here(),
         ]
         if isinstance(self.viewer, HeadlessScreen):
             lasting.append(self.viewer.run())
@@ -164,6 +169,12 @@ class _Show:
 
     def _on_epoch(self) -> None:
         log.info("the sender has started anew")
+        self._appeared.set()
+
+    def _on_presence(self, there: bool) -> None:
+        self._state.presence(there)
+        if there:
+            self._appeared.set()
 
     def _on_pose(self, message: bytes) -> None:
         """A candidate pose is complete; when too many wait for meshing the oldest goes."""
@@ -192,8 +203,30 @@ class _Show:
                 self._meshes.popleft()
                 self._counts["pose waiting too long"] += 1
             self._meshes.append(mesh)
+            self._note_held(mesh.epoch, mesh.mesh.pose_id, len(message))
             if self._state.first_body_ns is None and self._newest is not None:
                 self._animation.submit(self._newest)  # the first sight waits for no other skeleton
+
+    def _note_held(self, epoch: int, pose_id: int, size: int) -> None:
+        if epoch != self._held[0]:
+            self._held = epoch, {}
+        held = self._held[1]
+        held[pose_id] = size
+        if len(held) > REPOSITORY_LIST_MAX_POSES:
+            del held[next(iter(held))]
+
+    async def _tell_what_is_here(self) -> None:
+        """Whenever a sender appears: a pose that is here need not be sent (again)."""
+        while True:
+            await self._appeared.wait()
+            self._appeared.clear()
+            while not self._appeared.is_set():
+                offered = await self._channels.ask_repository(*self._held)
+                if offered is not None:
+                    self._offered_poses = len(offered)
+                    log.info("of the sender's %d poses %d are here", len(offered), len(self._held[1]))
+                    break
+                await asyncio.sleep(BODY_PERIOD_S)
 
     def _on_shown(self, shown: Shown) -> None:
         """On the loop: the animated mesh is ready."""
@@ -274,6 +307,7 @@ class _Show:
         metrics.counter("frames_shown_total", "Frames given to the viewer", lambda: self._state.frames_shown)
         metrics.counter("dropped_total", "What was dropped, by cause", self._dropped)
         metrics.gauge("repository_poses", "Candidate poses held", lambda: self._state.repository_poses)
+        metrics.gauge("offered_poses", "Poses the sender held when it was last asked", lambda: self._offered_poses)
         about = "Distortion of each region of the mesh on screen (DISPOSE Eq. 1)"
         metrics.gauge("region_sigma", about, lambda: self._state.region_sigma, "region")
         return metrics

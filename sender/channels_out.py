@@ -7,7 +7,7 @@ from collections.abc import Callable
 from common.runtime.clock import Clock
 from common.transport import channels
 from common.transport.channel_publisher import ChannelPublisher
-from common.transport.channel_query import ChannelQueryable
+from common.transport.channel_query import ChannelQueryable, Question
 from common.transport.channel_subscriber import Arrival, ChannelSubscriber
 from common.transport.channels import ANY, Channel, channel_key
 from common.transport.clock_exchange import serve_clock
@@ -27,11 +27,17 @@ class SenderChannels:
         self._body_message: bytes | None = None
         self.reports: ChannelSubscriber | None = None
 
-    def open(self, on_report: Callable[[Arrival], None], status: Callable[[], bytes]) -> None:
+    def open(
+        self,
+        on_report: Callable[[Arrival], None],
+        on_repository: Callable[[Question], bytes],
+        status: Callable[[], bytes],
+    ) -> None:
         """Answer questions, listen to reports, and be seen."""
         session = self._session
         ChannelQueryable(session, channels.BODY, self._key(channels.BODY), lambda _: self._body_message)
         ChannelQueryable(session, channels.STATUS, self._key(channels.STATUS), lambda _: status())
+        ChannelQueryable(session, channels.REPOSITORY, self._key(channels.REPOSITORY, ANY), on_repository)
         serve_clock(session, self._key(channels.CLOCK), self._clock)
         key = self._key(channels.REPORT, ANY)
         self.reports = ChannelSubscriber(session, channels.REPORT, key, on_report, self._clock)

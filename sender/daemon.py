@@ -190,7 +190,7 @@ class _Stream:
 
     async def run(self, daemon: Daemon) -> None:
         """Capture, fit, publish until the source ends."""
-        self._channels.open(self._links.on_report, self.metrics.text)
+        self._channels.open(self._links.on_report, self._links.on_repository, self.metrics.text)
         async with asyncio.TaskGroup() as group:
             lasting = [group.create_task(part.run()) for part in (self._fitting, self._meshing, self._links)]
             await asyncio.gather(self._fitting.wait_ready(), self._meshing.wait_ready())

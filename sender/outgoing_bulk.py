@@ -5,9 +5,19 @@ The live sender asks with what its window allows, the encoder of a session with 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Iterable
 
 from sender.candidate_poses.mesh_scheduler import MeshScheduler, SendRecord
+
+
+def pose_name(pose_id: int, preview: bool = False) -> tuple[str, int, bool]:
+    """The name of a candidate pose on its way."""
+    return "pose", pose_id, preview
+
+
+def poses_in(names: Iterable[Hashable]) -> list[int]:
+    """The ids of the whole candidate poses among the names."""
+    return [name[1] for name in names if isinstance(name, tuple) and name == pose_name(name[1])]
 
 
 class OutgoingBulk:
@@ -28,4 +38,4 @@ class OutgoingBulk:
         if record is None:
             return None
         self._on_sent(record)
-        return ("pose", pose_id, record.preview), payload
+        return pose_name(pose_id, record.preview), payload

@@ -12,22 +12,26 @@ from common.runtime.clock import Clock
 from common.transport.bulk_sender import PERIOD_NS, BulkMessage, BulkSender
 from common.transport.bulk_window import BulkWindow
 from common.transport.channel_publisher import ChannelPublisher
+from common.transport.channel_query import Question
 from common.transport.channel_subscriber import Arrival
 from common.transport.channels import receiver_of
 from common.wire.receiver_report import decode_report
+from common.wire.repository_list import RepositoryList, decode_repository_list, encode_repository_list
 from sender.candidate_poses.mesh_scheduler import MeshScheduler, SendRecord
-from sender.outgoing_bulk import OutgoingBulk
+from sender.outgoing_bulk import OutgoingBulk, pose_name, poses_in
 
 log = logging.getLogger(__name__)
 
 RECEIVERS_MAX = 16  # anyone who may write reports could claim any number of names
 GONE_AFTER_NS = 5_000_000_000
+LIST_WITHIN_NS = 2_000_000_000  # after the first report of a receiver that has poses of this run
 LOOK_EVERY_S = 0.5
 
 
 @dataclass(slots=True)
 class ReceiverLink:
-    """One run of one receiver. ``publisher`` carries its own bulk key."""
+    """One run of one receiver. ``publisher`` carries its own bulk key. ``list_due_ns``: nothing is sent before, or
+    before the receiver told what it has. ``away``: its reports have stopped."""
 
     name: str
     receiver_epoch: int
@@ -35,10 +39,14 @@ class ReceiverLink:
     bulk: BulkSender
     task: asyncio.Task[None]
     heard_ns: int
+    list_due_ns: int = 0
+    away: bool = False
 
 
 class ReceiverLinks:
-    """Opens a link with a receiver's first report and closes it when reports stop. ``counts``: opened, closed, refused.
+    """Opens a link with a receiver's first report, and keeps it when reports stop: a receiver that comes back goes on
+    where it was, half-sent poses included. Those away make room for others, the one silent longest first.
+    ``counts``: opened, closed, refused, away, back, superseded.
 
     ``open_publisher(name)`` gives the publisher of a receiver's bulk channel; ``on_sent`` is told of every send.
     """
@@ -64,7 +72,7 @@ class ReceiverLinks:
     @property
     def links(self) -> tuple[ReceiverLink, ...]:
         """The receivers there are now."""
-        return tuple(self._links.values())
+        return tuple(link for link in self._links.values() if not link.away)
 
     async def run(self) -> None:
         """Serve all links until cancelled; raises what one of them raised."""
@@ -73,19 +81,25 @@ class ReceiverLinks:
                 self._group = group
                 while True:
                     await asyncio.sleep(LOOK_EVERY_S)
-                    self._close_silent()
+                    self._note_silent()
         finally:
             self._group = None  # reports go on while the session closes, and open nothing
 
-    def _close_silent(self) -> None:
+    def _note_silent(self) -> None:
         now_ns = self._clock.now_ns()
         for link in self.links:
             if now_ns - link.heard_ns > GONE_AFTER_NS:
-                self._close(link, "no reports any more")
+                link.away = True
+                self.counts["away"] += 1
+                log.info("receiver %s is away: no reports any more", link.name)
 
     def wake(self) -> None:
-        """The scheduler has something new."""
+        """The scheduler has something new, which may be better than what is on its way."""
         for link in self._links.values():
+            for pose_id in self._scheduler.superseded(link.name, poses_in(link.bulk.under_way)):
+                link.bulk.cancel(pose_name(pose_id))
+                self.counts["superseded"] += 1
+                log.debug("pose %d is on its way to %s no more: superseded", pose_id, link.name)
             link.bulk.wake()
 
     def on_report(self, arrival: Arrival) -> None:
@@ -95,18 +109,47 @@ class ReceiverLinks:
             WireError: it is malformed.
         """
         report = decode_report(arrival.payload)
-        name = receiver_of(arrival.key)
+        known = self._links.get(receiver_of(arrival.key))
+        link = self._link(receiver_of(arrival.key), report.receiver_epoch)
+        if link is None:
+            return
+        if link is not known and report.sender_epoch == self._epoch and report.repository_poses > 0:
+            link.list_due_ns = arrival.arrival_ns + LIST_WITHIN_NS
+        if link.away:
+            link.away = False
+            self.counts["back"] += 1
+            log.info("receiver %s is back", link.name)
+        link.heard_ns = arrival.arrival_ns
+        link.bulk.on_report(report)
+
+    def on_repository(self, question: Question) -> bytes:
+        """A receiver tells what it has; the answer is what there is here.
+
+        Raises:
+            WireError: it is malformed.
+        """
+        told = decode_repository_list(question.payload)
+        link = self._link(receiver_of(question.key), told.receiver_epoch)
+        if link is not None:
+            link.list_due_ns = 0
+            if told.sender_epoch == self._epoch:
+                self._scheduler.receiver_joined(link.name, told.receiver_epoch, told.poses)
+            link.bulk.wake()
+        return encode_repository_list(RepositoryList(self._epoch, told.receiver_epoch, self._scheduler.holding))
+
+    def _link(self, name: str, receiver_epoch: int) -> ReceiverLink | None:
+        """The link to this run of a receiver, opened if need be; None when there are too many."""
         link = self._links.get(name)
-        if link is not None and link.receiver_epoch != report.receiver_epoch:
+        if link is not None and link.receiver_epoch != receiver_epoch:
             self._close(link, "restarted")
             link = None
-        if link is None:
-            link = self._open(name, report.receiver_epoch)
-        if link is not None:
-            link.heard_ns = arrival.arrival_ns
-            link.bulk.on_report(report)
+        return link or self._open(name, receiver_epoch)
 
     def _open(self, name: str, receiver_epoch: int) -> ReceiverLink | None:
+        if len(self._links) >= RECEIVERS_MAX:
+            silent = [link for link in self._links.values() if link.away]
+            if silent:
+                self._close(min(silent, key=lambda link: link.heard_ns), "away, and another needs its place")
         if self._group is None or len(self._links) >= RECEIVERS_MAX:
             self.counts["refused"] += 1
             return None
@@ -116,7 +159,10 @@ class ReceiverLinks:
         choice = OutgoingBulk(name, self._scheduler, self._on_sent)
 
         def next_message(budget_bytes: int) -> BulkMessage | None:
-            chosen = choice.next_message(budget_bytes * 1_000_000_000 // PERIOD_NS, self._clock.now_ns())
+            now_ns = self._clock.now_ns()
+            if now_ns < self._links[name].list_due_ns:
+                return None
+            chosen = choice.next_message(budget_bytes * 1_000_000_000 // PERIOD_NS, now_ns)
             return None if chosen is None else BulkMessage(*chosen)
 
         def delivered(message: Hashable) -> None:

@@ -12,6 +12,7 @@ from common.body.skeleton import human_skeleton
 from common.body.skeleton_pose import rest_pose
 from common.runtime.clock import MonotonicClock
 from common.transport import channels
+from common.transport.channel_query import Question
 from common.transport.channel_subscriber import Arrival
 from common.transport.channels import channel_key
 from common.transport.chunks import OutgoingMessage
@@ -19,6 +20,7 @@ from common.transport.link_settings import LinkSettings
 from common.transport.zenoh_session import ZenohSession, open_session
 from common.wire.body_message import BodyMessage, encode_body
 from common.wire.receiver_report import decode_report
+from common.wire.repository_list import RepositoryList, decode_repository_list, encode_repository_list
 from common.wire.skeleton_packet import SkeletonPacket, encode_skeleton
 from receiver.channels_in import Handlers, ReceiverChannels
 from scripts.daemon_processes import free_port
@@ -45,9 +47,10 @@ class Ends:
         self.sending = sending
         self.heard: dict[str, list[object]] = {"skeleton": [], "pose": [], "body": [], "epoch": [], "presence": []}
         self.reports: list[Arrival] = []
+        self.questions: list[Question] = []
         self.sender = SenderChannels(sending, "studio", 0, CLOCK)
         self.receiver = ReceiverChannels(receiving, "studio", 0, "wall", 1, 2, CLOCK)
-        self.sender.open(self.reports.append, lambda: b"fine")
+        self.sender.open(self.reports.append, self._answer, lambda: b"fine")
         heard = self.heard
         self.receiver.open(
             Handlers(
@@ -58,6 +61,11 @@ class Ends:
                 presence=heard["presence"].append,
             )
         )
+
+    def _answer(self, question: Question) -> bytes:
+        self.questions.append(question)
+        told = decode_repository_list(question.payload)
+        return encode_repository_list(RepositoryList(told.sender_epoch, told.receiver_epoch, {4: 400, 5: 500}))
 
     def raw(self, channel: channels.Channel, payload: bytes, receiver: str | None = None) -> None:
         """Put bytes as anyone on the network could."""
@@ -102,6 +110,18 @@ async def test_a_late_receiver_asks_for_the_body():
         await until(lambda: both.receiver.stream.lacks_body)
         await both.receiver.ask_body()
         assert not both.receiver.stream.lacks_body
+
+
+async def test_what_is_here_is_told_and_what_is_there_is_learned():
+    async with ends() as both:
+        assert await both.receiver.ask_repository(EPOCH, {1: 100}) is None  # of whom, is not known yet
+        both.sender.publish_skeleton(packet(0))
+        await until(lambda: both.receiver.stream.skeletons.newest)
+        assert await both.receiver.ask_repository(EPOCH, {1: 100}) == {4: 400, 5: 500}
+        assert await both.receiver.ask_repository(EPOCH - 1, {1: 100}) == {4: 400, 5: 500}
+        told = [decode_repository_list(question.payload) for question in both.questions]
+        assert told == [RepositoryList(EPOCH, 2, {1: 100}), RepositoryList(EPOCH, 2, {})]
+        assert {question.key for question in both.questions} == {"v1/studio/0/repository/wall"}
 
 
 async def test_a_new_run_is_told_and_forgets_the_old_clock():
@@ -189,7 +209,7 @@ async def test_a_vanished_sender_is_noticed(tmp_path):
     async with open_session(LinkSettings(connect=link)) as receiving:
         ReceiverChannels(receiving, "studio", 0, "wall", 1, 2, CLOCK).open(nothing)
         async with open_session(LinkSettings(listen=link)) as sending:
-            SenderChannels(sending, "studio", 0, CLOCK).open(lambda _: None, lambda: b"")
+            SenderChannels(sending, "studio", 0, CLOCK).open(lambda _: None, lambda _: b"", lambda: b"")
             await until(lambda: presence == [True])
         await until(lambda: not presence[-1])
         assert presence == [True, False]

@@ -177,8 +177,22 @@ def test_a_receiver_keeps_what_it_has_until_it_restarts() -> None:
 
 def test_a_receiver_that_holds_poses_is_not_sent_them() -> None:
     sender = Sender(0.3, 0.4)
-    sender.scheduler.receiver_joined("s", epoch=1, holding=[0, 77])
+    sender.scheduler.receiver_joined("s", epoch=1, holding={0: POSE_BYTES, 77: POSE_BYTES})
     assert sender.ids(2, receiver="s") == [1, None]
+    assert sender.scheduler.holding == {0: POSE_BYTES, 1: POSE_BYTES}
+
+
+def test_a_receiver_that_holds_a_preview_lacks_the_pose() -> None:
+    sender = Sender(0.3, 0.4)
+    sender.scheduler.receiver_joined("s", epoch=1, holding={0: POSE_BYTES // 10, 1: POSE_BYTES})
+    assert sender.ids(2, receiver="s") == [0, None]
+
+
+def test_what_a_receiver_tells_later_is_added_to_what_it_was_sent() -> None:
+    sender = Sender(0.3, 0.4, 0.5)
+    assert sender.ids(1) == [2]
+    sender.scheduler.receiver_joined("r", epoch=1, holding={1: POSE_BYTES})
+    assert sender.ids(2) == [0, None]
 
 
 def test_strangers_and_those_who_left_get_nothing() -> None:
@@ -225,7 +239,7 @@ def by_coverage(*holding: int, ids: tuple[int, ...] = (0, 1, 2, 3)) -> MeshSched
     for pose_id in ids:
         coverage = Coverage(ids, COVERAGE.sigmas[rows])
         scheduler.offer(pose_id, payload(pose_id), pose_id * SECOND, coverage)
-    scheduler.receiver_joined("r", 1, holding)
+    scheduler.receiver_joined("r", 1, dict.fromkeys(holding, POSE_BYTES))
     return scheduler
 
 
@@ -241,10 +255,10 @@ def test_by_coverage_the_pose_that_adds_most_to_what_the_receiver_has_goes_next(
 
 def test_each_receiver_has_its_own_coverage() -> None:
     scheduler = by_coverage(0)
-    scheduler.receiver_joined("s", 1, [2])
+    scheduler.receiver_joined("s", 1, {2: POSE_BYTES})
     assert [send(scheduler, SMALL, name) and send(scheduler, SMALL, name) for name in "rs"] == [None, None]
     scheduler = by_coverage(0)
-    scheduler.receiver_joined("s", 1, [2])
+    scheduler.receiver_joined("s", 1, {2: POSE_BYTES})
     first = [send(scheduler, SMALL, name) for name in "rs"]
     assert [record.pose_id for record in first if record is not None] == [2, 0]
 
@@ -257,6 +271,49 @@ def test_with_ample_bandwidth_the_newest_goes_first_whatever_it_adds() -> None:
         (2, Reason.GAIN),
         None,
     ]
+
+
+# Pose 1 does all that pose 0 does, and much more; pose 2 does a little else.
+BETTER = np.array([[1.9, 3.0, 3.0], [0.1, 0.1, 3.0], [3.0, 3.0, 2.9]], np.float32)
+
+
+def superseded(sigmas: np.ndarray, under_way: int, arrived: tuple[int, ...] = ()) -> tuple[int, ...]:
+    """What is superseded when ``under_way`` is on its way and then the other poses come up."""
+    scheduler = MeshScheduler()
+    scheduler.offer(under_way, payload(under_way), 0, Coverage((under_way,), sigmas[[under_way]]))
+    scheduler.receiver_joined("r", 1)
+    record = send(scheduler)
+    assert record is not None
+    assert record.pose_id == under_way
+    ids = tuple(range(len(sigmas)))
+    for pose_id in ids:
+        if pose_id != under_way:
+            scheduler.offer(pose_id, payload(pose_id), SECOND, Coverage(ids, sigmas))
+    scheduler.receiver_joined("r", 1, dict.fromkeys(arrived, POSE_BYTES))
+    lost = scheduler.superseded("r", [under_way])
+    assert scheduler.superseded("r", [under_way]) == ()  # said once
+    assert scheduler.superseded("nobody", [under_way]) == ()
+    if lost:
+        record = send(scheduler)
+        assert record is not None
+        assert record.pose_id not in lost
+    return lost
+
+
+def test_a_pose_on_its_way_gives_way_to_one_that_does_all_it_does_and_more() -> None:
+    assert superseded(BETTER, under_way=0) == (0,)
+    assert superseded(BETTER, under_way=1) == ()
+
+
+def test_a_pose_on_its_way_stays_when_the_better_one_is_there_already_or_little_better() -> None:
+    assert superseded(BETTER, under_way=0, arrived=(1,)) == ()
+    alike = np.array([[0.5, 0.5, 0.5], [0.4, 0.4, 0.4]], np.float32)  # somebody who stands still
+    assert superseded(alike, under_way=0) == ()
+
+
+def test_a_pose_on_its_way_stays_when_it_does_what_the_better_one_does_not() -> None:
+    beside = np.array([[1.0, 3.0, 3.0], [3.0, 0.0, 0.0]], np.float32)
+    assert superseded(beside, under_way=0) == ()
 
 
 def test_what_left_the_coverage_unsent_is_forgotten() -> None:

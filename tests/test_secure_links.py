@@ -24,7 +24,7 @@ from common.transport.access_rules import for_receiver, for_sender, receivers_of
 from common.transport.channel_publisher import ChannelPublisher
 from common.transport.channel_query import ChannelQueryable, ask
 from common.transport.channel_subscriber import Arrival, ChannelSubscriber
-from common.transport.channels import BODY, BULK, REPORT, SKELETON, Channel, channel_key
+from common.transport.channels import BODY, BULK, REPORT, REPOSITORY, SKELETON, Channel, channel_key
 from common.transport.link_settings import LinkSettings
 from common.transport.site_certificate import CertificateError, SiteCertificate, load_site_certificate
 from common.transport.zenoh_session import TransportError, ZenohSession, open_session
@@ -84,6 +84,7 @@ class Stream:
         self.skeletons, self.chunks = Heard(lobby, SKELETON, key(SKELETON)), Heard(lobby, BULK, key(BULK, NAME))
         self.reports = Heard(studio, REPORT, key(REPORT, "*"))
         ChannelQueryable(studio, BODY, key(BODY), lambda _: b"body")
+        ChannelQueryable(studio, REPOSITORY, key(REPOSITORY, "*"), lambda _: b"list")
 
     async def flows(self) -> bool:
         """A skeleton and a chunk arrive there, a report here."""
@@ -123,6 +124,7 @@ async def test_one_setting_gives_a_datagram_link_and_a_tls_link_with_names_at_bo
             assert str(links["tls"].reliability) == "Reliability.RELIABLE"
             assert {link.auth_identifier for link in links.values()} == {other}
         assert await ask(made.lobby, BODY, key(BODY)) == [b"body"]
+        assert await ask(made.lobby, REPOSITORY, key(REPOSITORY, NAME)) == [b"list"]
 
 
 def _any(value: Any) -> Any:
@@ -165,6 +167,7 @@ async def test_a_valid_certificate_opens_no_foreign_keys_in_either_direction(sit
         own = Heard(studio, REPORT, key(REPORT, "*"))
         skeletons = Heard(studio, SKELETON, key(SKELETON))
         ChannelQueryable(studio, BODY, key(BODY), lambda _: b"body")
+        ChannelQueryable(studio, REPOSITORY, key(REPOSITORY, "*"), lambda _: b"list")
         present = list[str]()
         studio.watch_presence(key(channels.RECEIVER_PRESENCE, "*"), lambda name, _: present.append(name))
         attacker = await asyncio.to_thread(outsider, pair(port), sites / site)
@@ -182,12 +185,15 @@ async def test_a_valid_certificate_opens_no_foreign_keys_in_either_direction(sit
                 attacker.put(each, b"forged", allowed_destination=zenoh.Locality.REMOTE)
             for each in (key(SKELETON), key(BULK, victim), key(BODY)):
                 studio.zenoh.put(each, b"secret", allowed_destination=zenoh.Locality.REMOTE)
-            answers = await asyncio.to_thread(lambda: list(attacker.get(key(BODY), timeout=0.5)))
+            answers, lists = await asyncio.to_thread(
+                lambda: [list(attacker.get(each, timeout=0.5)) for each in (key(BODY), key(REPOSITORY, victim))]
+            )
             await asyncio.sleep(0.3)
         finally:
             await asyncio.to_thread(_close, attacker)
     assert heard == []
     assert (own.payloads, skeletons.payloads, present) == ([], [], [])
+    assert lists == []
     assert [bool(answer.ok) for answer in answers] == ([] if site == "rogue" else [True])
 
 

@@ -25,9 +25,20 @@ from common.transport.bulk_arrivals import BulkArrivals, LeastDelay
 from common.transport.bulk_sender import BulkMessage, BulkSender
 from common.transport.bulk_window import BulkWindow
 from common.transport.channel_publisher import ChannelPublisher
-from common.transport.channel_query import ChannelQueryable, ask
+from common.transport.channel_query import ChannelQueryable, Question, ask
 from common.transport.channel_subscriber import Arrival, ChannelSubscriber
-from common.transport.channels import BODY, BULK, CLOCK, RECEIVER_PRESENCE, REPORT, SKELETON, Channel, channel_key
+from common.transport.channels import (
+    ANY,
+    BODY,
+    BULK,
+    CLOCK,
+    RECEIVER_PRESENCE,
+    REPORT,
+    REPOSITORY,
+    SKELETON,
+    Channel,
+    channel_key,
+)
 from common.transport.chunks import ChunkAssembler, decode_chunk
 from common.transport.clock_exchange import exchange_times, serve_clock
 from common.transport.clock_offset import ClockOffset
@@ -218,9 +229,9 @@ async def test_questions_are_answered_on_the_loop(endpoint: str) -> None:
         assert await ask(ends.dialler, BODY, key, timeout_s=0.5) == []
         threads: set[int] = set()
 
-        def answer(payload: bytes) -> bytes | None:
+        def answer(question: Question) -> bytes | None:
             threads.add(threading.get_ident())
-            return None if payload == b"secret" else b"body for " + payload
+            return None if question.payload == b"secret" else b"body for " + question.payload
 
         queryable = ChannelQueryable(ends.listener, BODY, key, answer)
         answers: list[bytes] = []
@@ -234,6 +245,27 @@ async def test_questions_are_answered_on_the_loop(endpoint: str) -> None:
             await ask(ends.dialler, BODY, key, bytes(BODY.max_bytes + 1))
         assert queryable.dropped == 0
         queryable.close()
+
+
+async def test_a_question_under_a_receivers_own_key_says_whose_it_is(endpoint: str) -> None:
+    def answer(question: Question) -> bytes:
+        if question.payload == b"bad":
+            raise WireError("bad: not what was expected")
+        return question.key.encode()
+
+    async with AsyncExitStack() as stack:
+        ends = await pair(stack, endpoint)
+        every = channel_key(REPOSITORY, "studio", 0, ANY)
+        queryable = ChannelQueryable(ends.listener, REPOSITORY, every, answer)
+        for name in ("wall", "desk"):
+            key = channel_key(REPOSITORY, "studio", 0, name)
+            async with asyncio.timeout(WITHIN_S):
+                while not (answers := await ask(ends.dialler, REPOSITORY, key)):
+                    pass
+            assert answers == [key.encode()]
+        assert await ask(ends.dialler, REPOSITORY, every) == []
+        assert await ask(ends.dialler, REPOSITORY, key, b"bad") == []
+        assert queryable.malformed == 2
 
 
 async def test_too_many_questions_at_once_are_dropped(endpoint: str) -> None:

@@ -21,7 +21,8 @@ _WATCH = ("declare_liveliness_subscriber", "liveliness_query")
 _SAYS: dict[Party, tuple[tuple[tuple[str, ...], tuple[Channel, ...]], ...]] = {
     "sender": (
         (("put",), (channels.SKELETON, channels.BODY, channels.BULK)),
-        (("declare_queryable", "reply"), _QUESTIONS),
+        (("declare_queryable",), (channels.BODY, channels.STATUS, channels.CLOCK)),
+        (("reply",), _QUESTIONS),
         (("liveliness_token",), (channels.SENDER_PRESENCE,)),
     ),
     "receiver": (
@@ -32,9 +33,10 @@ _SAYS: dict[Party, tuple[tuple[tuple[str, ...], tuple[Channel, ...]], ...]] = {
         (_WATCH, (channels.SENDER_PRESENCE,)),
     ),
 }
-# What a sender subscribes to is one expression for all receivers: what comes of it is bounded by their puts.
+# What a sender listens to is one expression for all receivers: what comes of it is bounded by what they may say.
 _SENDER_HEARS: tuple[tuple[tuple[str, ...], tuple[Channel, ...]], ...] = (
     (("declare_subscriber",), (channels.REPORT,)),
+    (("declare_queryable",), (channels.REPOSITORY,)),
     (_WATCH, (channels.RECEIVER_PRESENCE,)),
 )
 
@@ -117,11 +119,11 @@ def _rules(realm: str, allowance: Allowance, party: Party, flow: str, number: in
     stream = f"{realm}/{channels.SCHEMA}/{check_name('site', allowance.site)}/{ANY}"
     return [
         {
-            "id": f"{number} {party} {flow} {messages[0]}",
+            "id": f"{number} {party} {flow} {row} {messages[0]}",
             "permission": "allow",
             "flows": [flow],
             "messages": list(messages),
             "key_exprs": [f"{stream}/{channel.key.format(receiver=receivers)}" for channel in table],
         }
-        for messages, table, receivers in rows
+        for row, (messages, table, receivers) in enumerate(rows)
     ]

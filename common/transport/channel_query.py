@@ -6,27 +6,40 @@ import asyncio
 import contextlib
 import threading
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import zenoh
 from zenoh.handlers import Callback
 
-from common.transport.channels import Channel
+from common.transport.channels import ANY, Channel
 from common.transport.zenoh_session import ZenohSession
+from common.wire.header import WireError
 
 REPLIES_MAX = 16  # of one question: a hostile peer may send any number
 
 
-class ChannelQueryable:
-    """Answers questions under ``key`` with ``answer(payload)``, called on the loop; None: no answer.
+@dataclass(frozen=True, slots=True)
+class Question:
+    """``key``: under which it is asked, which says who asks where each receiver has its own."""
 
-    At most ``channel.keep`` questions wait for the loop; more are dropped unanswered and counted in ``dropped``.
+    key: str
+    payload: bytes
+
+
+class ChannelQueryable:
+    """Answers questions under ``key`` (an expression, perhaps) with ``answer(question)``, called on the loop; None: no
+    answer.
+
+    At most ``channel.keep`` questions wait for the loop; more are dropped unanswered and counted in ``dropped``. A
+    ``WireError`` raised by ``answer`` means a malformed question, counted in ``malformed``.
     """
 
     def __init__(
-        self, session: ZenohSession, channel: Channel, key: str, answer: Callable[[bytes], bytes | None]
+        self, session: ZenohSession, channel: Channel, key: str, answer: Callable[[Question], bytes | None]
     ) -> None:
         self.answered = 0
         self.dropped = 0
+        self.malformed = 0
         self._session = session
         self._channel = channel
         self._key = key
@@ -55,12 +68,22 @@ class ChannelQueryable:
     def _reply(self, query: zenoh.Query, payload: bytes) -> None:
         with self._lock:
             self._waiting -= 1
+        key = str(query.key_expr)
+        if ANY not in self._key:
+            key = self._key
         with query:
-            reply = self._answer(payload)
+            if ANY in key:  # asked of nobody in particular
+                self.malformed += 1
+                return
+            try:
+                reply = self._answer(Question(key, payload))
+            except WireError:
+                self.malformed += 1
+                return
             if reply is not None:
                 if len(reply) > self._channel.max_bytes:
                     raise ValueError(f"{self._channel.name}: an answer of {len(reply)} bytes")
-                query.reply(self._key, reply)
+                query.reply(key, reply)
                 self.answered += 1
 
 

@@ -52,7 +52,7 @@ SKELETON = Channel("skeleton", _P.REAL_TIME, _BEST_EFFORT, 250, express=True, ke
 BODY = Channel("body", _P.DATA_HIGH, _RELIABLE, 16 << 10, keep=4)
 BULK = Channel("bulk/{receiver}", _P.DATA_LOW, _RELIABLE, 32 << 10, keep=512)
 REPORT = Channel("report/{receiver}", _P.REAL_TIME, _BEST_EFFORT, 1 << 10, express=True, keep=8)
-REPOSITORY = Channel("repository", _P.INTERACTIVE_HIGH, _RELIABLE, 64 << 10, keep=16, recorded=False)
+REPOSITORY = Channel("repository/{receiver}", _P.INTERACTIVE_HIGH, _RELIABLE, 16 << 10, keep=16, recorded=False)
 STATUS = Channel("status", _P.DATA, _RELIABLE, 64 << 10, min_bytes=0, keep=16, recorded=False)
 CLOCK = Channel("clock", _P.REAL_TIME, _RELIABLE, 64, min_bytes=0, express=True, keep=16, recorded=False)
 SENDER_PRESENCE = Channel("sender", _P.DATA, _RELIABLE, 0, min_bytes=0, recorded=False)

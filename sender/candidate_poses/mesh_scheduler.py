@@ -7,7 +7,7 @@ receivers that join late.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
 
@@ -20,7 +20,8 @@ class SchedulerSettings:
     """``max_bytes, max_poses``: bound on the encoded poses held. ``ample_poses``: bandwidth is ample when that many
     fit in a second: then RT is its full share, ``retain_share``, of χ_s, and by coverage the newest pose goes first.
     ``first_s``: a first pose that takes longer is sent as its small preview. ``least_gain``: of σ, for a pose to be
-    worth sending by coverage."""
+    worth sending by coverage. ``supersede``: a pose on its way gives way to one that adds so many times as much and
+    leaves it so small a share (its inverse) of what it adds."""
 
     max_bytes: int = 64 << 20
     max_poses: int = 200
@@ -29,6 +30,7 @@ class SchedulerSettings:
     retain_share: float = 0.8
     first_s: float = 0.3
     least_gain: float = 1e-4
+    supersede: float = 2.0
 
 
 class Reason(StrEnum):
@@ -129,17 +131,23 @@ class MeshScheduler:
             if pose.pose_id not in known and not pose.was_sent and pose.pose_id != self._newest:
                 self._forget(pose.pose_id)
 
-    def receiver_joined(self, receiver_id: str, epoch: int, holding: Iterable[int] = ()) -> bool:
-        """A receiver is there, with the poses ``holding``; a new ``epoch`` means it restarted with nothing else.
-        False: there are too many receivers."""
+    def receiver_joined(self, receiver_id: str, epoch: int, holding: Mapping[int, int] | None = None) -> bool:
+        """A receiver is there; a new ``epoch`` means it restarted with nothing else. ``holding``: the bytes of the
+        poses it has, by id; fewer than a pose's own are its preview's. False: there are too many receivers."""
         known = self._receivers.get(receiver_id)
         if known is None and len(self._receivers) >= self._settings.max_receivers:
             return False
         if known is None or known.epoch != epoch:
             known = self._receivers[receiver_id] = _Receiver(epoch)
-        known.has.update(self._held.keys() & set(holding))
-        known.sees = known.sees or bool(known.has)
+        whole = {i for i, size in (holding or {}).items() if i in self._held and size == len(self._held[i].encoded)}
+        known.has |= whole
+        known.sees = known.sees or bool(whole)
         return True
+
+    @property
+    def holding(self) -> dict[int, int]:
+        """The bytes of the poses held, by id."""
+        return {pose.pose_id: len(pose.encoded) for pose in self._held.values()}
 
     def receiver_left(self, receiver_id: str) -> None:
         """Forget a receiver; unknown ones are ignored."""
@@ -188,6 +196,28 @@ class MeshScheduler:
             self._held[pose_id].was_sent = True
             receiver.has.add(pose_id)
         return record
+
+    def superseded(self, receiver_id: str, under_way: Collection[int]) -> tuple[int, ...]:
+        """Those of the poses on their way to a receiver that are not worth the rest of the way since a better one is
+        here: by coverage one that adds much more, and with which they would add little. The receiver lacks them again.
+        """
+        receiver = self._receivers.get(receiver_id)
+        if receiver is None or self._coverage is None:
+            return ()
+        arrived = receiver.has - set(under_way)
+        lacking = [pose_id for pose_id in self._held if pose_id not in receiver.has]
+        going = [pose_id for pose_id in under_way if pose_id in receiver.has]
+        if not lacking or not going:
+            return ()
+        times = self._settings.supersede
+        gains = self._coverage.gains(lacking, arrived)
+        best, most = lacking[int(gains.argmax())], float(gains.max())
+        now, then = self._coverage.gains(going, arrived), self._coverage.gains(going, arrived | {best})
+        lost = [
+            i for i, gain, left in zip(going, now, then, strict=True) if most > times * gain and gain > times * left
+        ]
+        receiver.has.difference_update(lost)
+        return tuple(lost)
 
     def _worth(self, lacking: list[_Held], receiver: _Receiver) -> dict[int, float]:
         """χ of each pose, or what it would add to those the receiver has."""
