@@ -49,18 +49,23 @@ class RepositorySettings:
 @dataclass(frozen=True, slots=True)
 class ViewSettings:
     """``headless``: render offscreen instead of serving a page. ``display_hz``: rate of display ticks.
+    ``smoothness``: 0 shows the newest skeleton at once, 1 plays them at an even pace, later; between, with less delay,
+    more of the motion is extrapolated.
     ``window``: the page in a desktop window too, whose closing ends the receiver (needs the ``open3d`` extra).
     ``skinning``: how a mesh bends at its joints. ``allowed_hosts``: names besides loopback ones for the page."""
 
     headless: bool = False
     window: bool = False
     display_hz: float = 30.0
+    smoothness: float = 0.0
     skinning: Literal["rigid", "linear", "spherical"] = "spherical"
     allowed_hosts: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if not 1 <= self.display_hz <= 240:
             raise ValueError(f"display_hz: {self.display_hz} is outside 1..240")
+        if not 0 <= self.smoothness <= 1:
+            raise ValueError(f"smoothness: {self.smoothness} is outside 0..1")
         if self.headless and self.window:
             raise ValueError("window: a headless receiver has none")
 

@@ -33,6 +33,7 @@ from common.wire.repository_list import REPOSITORY_LIST_MAX_POSES
 from common.wire.skeleton_packet import SkeletonPacket
 from receiver.channels_in import Handlers, ReceiverChannels
 from receiver.config import ReceiverSettings
+from receiver.jitter_buffer import JitterBuffer
 from receiver.pipeline import AnimationPath, ReceivedPose, Shown, SkeletonToShow, mesh_of
 from receiver.rehearsal import rehearse
 from receiver.show_log import ShowLog
@@ -116,6 +117,8 @@ class _Show:
         self._appeared = asyncio.Event()
         self._meshes: deque[ReceivedPose] = deque()  # meshed, waiting for the next skeleton; bounded in _mesh_poses
         self._newest: SkeletonToShow | None = None
+        smoothness = settings.view.smoothness
+        self._jitter = JitterBuffer(smoothness) if smoothness > 0 else None  # without it the newest wins
         self._log = ShowLog(settings.shown_log) if settings.shown_log else None
         self.viewer: WebViewer | HeadlessScreen = (
             HeadlessScreen(self._timer, skinning=settings.view.skinning)
@@ -161,6 +164,12 @@ class _Show:
     def _on_skeleton(self, packet: SkeletonPacket, body: Skeleton, data: bytes) -> None:
         self._state.skeleton()
         self._record("skeleton", data)
+        if self._jitter is None:
+            self._animate(packet, body)
+        else:
+            self._jitter.push(packet, body, self._clock.now_ns())
+
+    def _animate(self, packet: SkeletonPacket, body: Skeleton) -> None:
         self._newest = SkeletonToShow(packet, body, self._meshes)
         self._animation.submit(self._newest)
 
@@ -249,12 +258,14 @@ class _Show:
         self._record("frame", [shown.epoch, frame.sequence, frame.pose_id, sigma, latency_ns])
 
     def _tick(self) -> None:
-        """A display tick: what is on screen now, and how old."""
+        """A display tick: what is on screen now, and how old; and what should be next where the pace is ours."""
         frame = self._state.frame
         age_ns = None if frame is None else self._channels.age_ns(frame.capture_ns, self._clock.now_ns())
         if age_ns is not None:
             self._timer.add("pose age at tick", age_ns)
         self._record("tick", [None if frame is None else frame.sequence, age_ns])
+        if self._jitter is not None and (due := self._jitter.play(self._clock.now_ns())) is not None:
+            self._animate(due.packet, due.body)
         if isinstance(self.viewer, HeadlessScreen):
             self.viewer.tick()
 
@@ -308,6 +319,11 @@ class _Show:
         metrics.counter("dropped_total", "What was dropped, by cause", self._dropped)
         metrics.gauge("repository_poses", "Candidate poses held", lambda: self._state.repository_poses)
         metrics.gauge("offered_poses", "Poses the sender held when it was last asked", lambda: self._offered_poses)
+        jitter = self._jitter
+        if jitter is not None:
+            about = "How much later than at the soonest skeletons are shown"
+            metrics.gauge("jitter_delay_ms", about, lambda: jitter.delay_ns / 1e6)
+            metrics.counter("played_total", "Display ticks by where their pose came from", lambda: jitter.counts)
         about = "Distortion of each region of the mesh on screen (DISPOSE Eq. 1)"
         metrics.gauge("region_sigma", about, lambda: self._state.region_sigma, "region")
         return metrics

@@ -76,10 +76,30 @@ def test_impossible_times_are_refused_and_counted() -> None:
         clock.offset_ns(0)
 
 
-def test_what_is_forgotten_or_an_hour_old_does_not_count() -> None:
+@pytest.mark.parametrize("step_ns", [3600 * S, -3600 * S, 200 * MS, -200 * MS])
+def test_a_step_is_followed_at_once_although_the_exchanges_before_were_quicker(step_ns: int) -> None:
+    clock = ClockOffset()
+    for second in range(20):
+        exchange(clock, second * S, 2 * MS, 2 * MS)
+    exchange(clock, 20 * S, 40 * MS, 40 * MS, offset_ns=OFFSET_NS + step_ns)
+    assert clock.offset_ns(20 * S) == OFFSET_NS + step_ns
+    assert clock.steps == 1
+
+
+@given(
+    st.lists(st.tuples(st.integers(0, 500 * MS), st.integers(0, 500 * MS)), min_size=1, max_size=60),
+    st.sampled_from([60e-6, -60e-6]),
+)
+def test_jitter_and_ordinary_drift_are_no_step(delays: list[tuple[int, int]], drift: float) -> None:
+    clock = ClockOffset()
+    for number, (there_ns, back_ns) in enumerate(delays):
+        at_ns = 4 * number * S
+        exchange(clock, at_ns, there_ns, back_ns, OFFSET_NS + int(at_ns * drift))
+    assert clock.steps == 0
+
+
+def test_what_is_forgotten_does_not_count() -> None:
     clock = ClockOffset()
     exchange(clock, 0, MS, MS)
-    exchange(clock, 2 * 3600 * S, 50 * MS, 50 * MS, offset_ns=OFFSET_NS + S)
-    assert clock.offset_ns(2 * 3600 * S) == OFFSET_NS + S
     clock.forget()
     assert not clock.known

@@ -27,11 +27,17 @@ class ClockOffset:
         self._exchanges: deque[_Exchange] = deque(maxlen=remembered)
         self._drift_ppm = drift_ppm
         self._refused = 0
+        self._steps = 0
 
     @property
     def refused(self) -> int:
         """How many exchanges had impossible times."""
         return self._refused
+
+    @property
+    def steps(self) -> int:
+        """How often a clock has jumped: a host that slept, say, whose monotonic clock stood still."""
+        return self._steps
 
     @property
     def known(self) -> bool:
@@ -44,9 +50,11 @@ class ClockOffset:
         if held_ns < 0 or round_trip_ns < 0:
             self._refused += 1
             return False
-        if self._exchanges and abs(t3_ns - self._exchanges[-1].at_ns) > 3600 * 10**9:
-            self._exchanges.clear()  # an hour old: worth nothing against the drift
-        self._exchanges.append(_Exchange(t3_ns, (t1_ns - t0_ns + t2_ns - t3_ns) // 2, round_trip_ns))
+        new = _Exchange(t3_ns, (t1_ns - t0_ns + t2_ns - t3_ns) // 2, round_trip_ns)
+        if any(self._contradict(old, new) for old in self._exchanges):
+            self._exchanges.clear()
+            self._steps += 1
+        self._exchanges.append(new)
         return True
 
     def forget(self) -> None:
@@ -81,6 +89,10 @@ class ClockOffset:
         if not self._exchanges:
             raise LookupError("no exchange of times yet")
         return min(self._exchanges, key=lambda exchange: self._error_ns(exchange, now_ns))
+
+    def _contradict(self, old: _Exchange, new: _Exchange) -> bool:
+        """Whether clocks that run cannot give both: each is wrong by half its round trip and the drift at most."""
+        return abs(old.offset_ns - new.offset_ns) > self._error_ns(old, new.at_ns) + new.round_trip_ns // 2 + 1
 
     def _error_ns(self, exchange: _Exchange, now_ns: int) -> int:
         return exchange.round_trip_ns // 2 + max(0, now_ns - exchange.at_ns) * self._drift_ppm // 1_000_000
