@@ -78,10 +78,10 @@ class ReceiverChannels:
         for subscriber in self.subscribers.values():
             subscriber.close()
 
-    def send_report(self, repository_poses: int) -> None:
-        """Tell the sender's bulk window how things are."""
+    def send_report(self, repository_poses: int, wants: int = 0) -> None:
+        """Tell the sender's bulk window how things are, and what this receiver has a use for."""
         now_ns = self._clock.now_ns()
-        report = self._reception.report(now_ns, self.stream.body_revision, repository_poses)
+        report = self._reception.report(now_ns, self.stream.body_revision, repository_poses, wants)
         self._report.put(encode_report(report))
 
     async def ask_time(self) -> None:

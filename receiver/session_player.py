@@ -14,6 +14,7 @@ from common.runtime.stage_timer import StageTimer
 from common.transport import channels
 from common.transport.chunks import decode_chunk
 from common.wire.header import WireError
+from common.wire.residual_packet import is_residual
 from receiver.config import RepositorySettings
 from receiver.incoming_stream import IncomingStream
 from receiver.pipeline import AnimationPath, ReceivedPose, Shown, SkeletonToShow, mesh_of
@@ -66,7 +67,9 @@ class SessionPlayer:
 
     def _take_chunk(self, payload: bytes) -> None:
         whole = self._stream.chunk(decode_chunk(payload))
-        if whole is not None:
+        if whole is not None and is_residual(whole):
+            self.counts["residuals"] += 1
+        elif whole is not None:
             self.counts["pose waiting too long"] += len(self._arrived) == MESHES_WAITING
             self._arrived.append(mesh_of(whole, self._person, self._settings.score_form))
             self.counts["poses"] += 1

@@ -24,7 +24,7 @@ EXAMPLES = """examples:
 ENCODE_EXAMPLES = """examples:
   telepose-send encode recordings/monday monday.mcap             what a link of 4 Mbit/s would carry
   telepose-send encode recordings/monday thin.mcap --mbit 0.5    a smaller file: fewer and coarser meshes
-  telepose-send encode walk.jsonl walk.mcap --no-poses           skeletons alone: 7.5 KB/s
+  telepose-send encode DIR skeletons.mcap --no-poses --no-residuals    skeletons alone: 7.5 KB/s
   telepose-receive decode monday.mcap monday.mp4                 and back: as a video (decode --help)
 
 The file holds what would go over the network, as it would at that bandwidth: the same recording and settings give the
@@ -80,8 +80,8 @@ def parse_encode_arguments(arguments: list[str]) -> argparse.Namespace:
     """What follows ``telepose-send encode`` → ``recording``, ``file``, ``mbit``, ``seconds``, and settings by key."""
     parser = argparse.ArgumentParser(
         prog="telepose-send encode",
-        description="Stores a recording as a receiver would get it: a skeleton of every frame, and meshes as the "
-        "bandwidth allows. Says what each takes, beside the raw images.",
+        description="Stores a recording as a receiver would get it: a skeleton of every frame, and, as the bandwidth "
+        "allows, meshes and residual maps. Says what each takes, beside the raw images.",
         epilog=ENCODE_EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
@@ -95,8 +95,9 @@ def parse_encode_arguments(arguments: list[str]) -> argparse.Namespace:
     parser.add_argument("--site", dest="site", metavar="NAME", help="the name in the file's keys (default: studio)")
     parser.add_argument("--person", dest="person", type=int, metavar="N", help="which person of it (default: 0)")
     parser.add_argument("--tracker", dest="tracking.tracker", metavar="NAME", help="as of telepose-send")
+    parser.add_argument("--no-poses", dest="poses.enabled", action="store_false", default=None, help="no meshes")
     parser.add_argument(
-        "--no-poses", dest="poses.enabled", action="store_false", default=None, help="skeletons only, no meshes"
+        "--no-residuals", dest="residuals.mode", action="store_const", const="off", help="no maps of what is missed"
     )
     return parser.parse_args(arguments)
 

@@ -110,6 +110,23 @@ class CandidateSettings:
 
 
 @dataclass(frozen=True, slots=True)
+class ResidualStreamSettings:
+    """Residual maps: what the skeleton misses, for receivers that show points. ``mode``: "auto" sends them to whoever
+    asks, at the level bandwidth allows. ``share``: of the bandwidth that candidate poses have a use for, too.
+    ``points``: of a frame at the full level."""
+
+    mode: Literal["off", "auto"] = "auto"
+    share: float = 0.5
+    points: int = 10_000
+
+    def __post_init__(self) -> None:
+        if not 0.05 <= self.share <= 0.95:
+            raise ValueError(f"share: {self.share} is outside 0.05..0.95")
+        if not 1000 <= self.points <= 200_000:
+            raise ValueError(f"points: {self.points} is outside 1000..200000")
+
+
+@dataclass(frozen=True, slots=True)
 class SelfViewSettings:
     """The sender's own person on a page of this host (DISPOSE §8). ``port``: of the page, on loopback."""
 
@@ -137,6 +154,7 @@ class SenderSettings:
     capture: CaptureSettings = field(default_factory=CaptureSettings)
     tracking: TrackingSettings = field(default_factory=TrackingSettings)
     poses: CandidateSettings = field(default_factory=CandidateSettings)
+    residuals: ResidualStreamSettings = field(default_factory=ResidualStreamSettings)
     self_view: SelfViewSettings = field(default_factory=SelfViewSettings)
     http: HttpSettings = field(default_factory=lambda: HttpSettings(port=9101))
 

@@ -39,7 +39,8 @@ from sender.fitting.particle_weights_opencl import OpenClUnavailable
 from sender.open_path import open_skeleton_path, open_synchronizer, outside_tracker
 from sender.pipeline import CandidatePath, Candidates, StreamIdentity, TrackedFrame
 from sender.receiver_links import ReceiverLinks
-from sender.rehearsal import rehearse_all, rehearse_candidates
+from sender.rehearsal import rehearse_all, rehearse_slow_paths
+from sender.residual_path import Residual, ResidualPath
 from sender.self_view import SelfView, open_self_view
 from sender.send_log import SendLog
 
@@ -99,7 +100,7 @@ class SenderDaemon:
 
         After a restart somebody waits for the picture; then the first frames load the kernels as they need them.
         """
-        rehearsal = rehearse_all if body is None else rehearse_candidates
+        rehearsal = rehearse_all if body is None else rehearse_slow_paths
         rehearsing = asyncio.create_task(asyncio.to_thread(rehearsal))
         source = await asyncio.to_thread(open_source, self._settings.capture)
         await rehearsing
@@ -161,14 +162,22 @@ class _Stream:
             identity, source, settings.tracking, self._tracker, self._outside, self._timer, clock
         )
         self._candidates = CandidatePath(identity, settings.poses, self._timer)
+        self._residuals = ResidualPath(identity, source.cameras, source.frame_rate_hz, settings.residuals, self._timer)
         self._scheduler = MeshScheduler()
         self._send_log = _open_send_log(settings.poses.send_log)
         self._channels = SenderChannels(session, settings.site, settings.person, clock)
         self._links = ReceiverLinks(
-            identity.epoch, self._scheduler, self._channels.bulk_publisher, self._on_sent, clock
+            identity.epoch,
+            self._scheduler,
+            self._channels.bulk_publisher,
+            self._on_sent,
+            clock,
+            settings.residuals.share,
         )
         self._fitting = ComputeWorker("fitting", self._fit, self._on_tracked)
         self._meshing = ComputeWorker("candidates", self._make_candidate, self._on_candidates, background=True)
+        # Not with the candidates: one of those takes as long as ten frames, and old maps are of no use.
+        self._mapping = ComputeWorker("residuals", self._residuals.process, self._on_residual, background=True)
         self._synchronizer = open_synchronizer(source, settings.capture.patience_ms)
         hurried = settings.capture.source != "recording" or settings.capture.realtime
         deliver = self._fitting.submit if hurried else self._fitting.submit_in_turn
@@ -179,6 +188,7 @@ class _Stream:
         self._pace = CandidatePace(int(settings.poses.interval_ms * 1e6), settings.poses.busy_share)
         self._published = 0
         self._poses_sent = 0
+        self._residual_level = 0.0
         self._skeleton_bytes_max = 0
         self._candidate_bytes: list[int] = []
         self.metrics = self._make_metrics()
@@ -192,8 +202,10 @@ class _Stream:
         """Capture, fit, publish until the source ends."""
         self._channels.open(self._links.on_report, self._links.on_repository, self.metrics.text)
         async with asyncio.TaskGroup() as group:
-            lasting = [group.create_task(part.run()) for part in (self._fitting, self._meshing, self._links)]
-            await asyncio.gather(self._fitting.wait_ready(), self._meshing.wait_ready())
+            lasting = [
+                group.create_task(part.run()) for part in (self._fitting, self._meshing, self._mapping, self._links)
+            ]
+            await asyncio.gather(*(worker.wait_ready() for worker in (self._fitting, self._meshing, self._mapping)))
             self._health.ready, self._health.reason = True, "capturing"
             daemon.announce_ready()
             if self._self_view is not None:
@@ -233,6 +245,24 @@ class _Stream:
                 self._pace.begin(tracked.capture_ns, now_ns)
                 self._candidates.note_budget(self._scheduler.budget_bytes)
                 self._meshing.submit(tracked)
+        if self._settings.residuals.mode == "auto":
+            self._map_residuals(tracked)
+
+    def _map_residuals(self, tracked: TrackedFrame) -> None:
+        """If anybody wants them, at the level their link allows."""
+        bytes_per_s = self._links.residual_bytes_s()
+        if bytes_per_s is None:
+            return
+        self._residuals.note_budget(bytes_per_s)
+        if self._links.lacks_residual_key:
+            self._residuals.request_key()
+        self._mapping.submit(tracked)
+
+    def _on_residual(self, residual: Residual | None) -> None:
+        """On the loop: the newest residual packet."""
+        if residual is not None:
+            self._residual_level = residual.level
+            self._links.offer_residual(residual)
 
     def _make_candidate(self, tracked: TrackedFrame) -> Candidates:
         """On the candidate thread, which gives way to all others: what counts is the time it had, not what passed."""
@@ -271,6 +301,10 @@ class _Stream:
         metrics.counter("frame_sets_total", "Synchronised sets", lambda: self._capture.sets)
         metrics.counter("skeletons_published_total", "Skeleton packets published", lambda: self._published)
         metrics.counter("candidate_poses_sent_total", "Deliveries", lambda: self._poses_sent)
+        residuals = self._links.residual_counts
+        metrics.counter("residual_packets_sent_total", "Deliveries", lambda: residuals()["sent"])
+        metrics.counter("residual_bytes_total", "Of residual packets sent", lambda: residuals()["bytes"])
+        metrics.gauge("residual_level", "Of the newest residual packet [%]", lambda: self._residual_level)
         metrics.counter("dropped_total", "What was dropped, by cause", self._dropped)
         metrics.gauge("receivers", "Receivers there are", lambda: len(self._links.links))
         return metrics
@@ -281,6 +315,8 @@ class _Stream:
         return {
             "fitting busy": self._fitting.dropped,
             "candidates busy": self._meshing.dropped,
+            "residuals busy": self._mapping.dropped,
+            "residual stale": self._links.residual_counts()["dropped"],
             "camera missing": late.missing,
             "frame late": late.late,
             "frame duplicate": late.duplicate,
@@ -306,6 +342,7 @@ class _Stream:
             "sends": self._send_log.figures(),
             "candidate_poses_delivered": self._links.delivered_poses,
             "candidate_pose_bytes_mean": sum(sizes) / len(sizes) if sizes else 0,
+            "residuals": dict(self._links.residual_counts()) | {"level": self._residual_level},
             "receivers": dict(self._links.counts),
             "dropped": self._dropped(),
             "source_epoch_ns": getattr(self._source, "epoch_ns", None),

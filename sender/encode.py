@@ -117,7 +117,7 @@ def summary(amount: EncodedAmount, size: int, cameras: int, file: Path) -> list[
     seconds = max(amount.seconds, 1e-3)
     lines = [
         f"{file}: {seconds:.1f} s, {amount.frame_sets} frames of {cameras} cameras, "
-        f"{amount.skeletons} skeletons, {amount.poses} candidate poses",
+        f"{amount.skeletons} skeletons, {amount.poses} candidate poses{_level(amount)}",
         f"{'':18}{'bytes/s':>12}{'raw images : 1':>18}",
     ]
     if amount.raw_bytes:
@@ -127,3 +127,7 @@ def summary(amount: EncodedAmount, size: int, cameras: int, file: Path) -> list[
         ratio = f"{amount.raw_bytes / taken:18,.0f}" if amount.raw_bytes else f"{'–':>18}"
         lines.append(f"{words:18}{taken / seconds:12,.0f}{ratio}")
     return lines
+
+
+def _level(amount: EncodedAmount) -> str:
+    return f", residual maps at {amount.level_sum / amount.residuals:.0f} % on average" if amount.residuals else ""

@@ -7,11 +7,12 @@ chunks and sent one after the other, as fast as the rate allows beside the skele
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Hashable, Iterator
+from collections.abc import Hashable, Iterator
 from dataclasses import dataclass
 
 from common.transport.bulk_window import CHUNK_HOLDS_S, CHUNK_LEAST_BYTES
 from common.transport.chunks import CHUNK_MAX_BYTES, OutgoingMessage
+from sender.outgoing_bulk import Outgoing, OutgoingBulk
 
 BUDGET_SHARE = 0.9  # as in BulkWindow.budget_bytes
 
@@ -26,19 +27,16 @@ class PacedChunk:
 
 
 class PacedBulk:
-    """``rate_bps``: of the link, all that goes over it. ``next_message(budget [bytes/s], now_ns)`` gives name and
-    payload of what to send when the link is free, or None."""
+    """``rate_bps``: of the link, all that goes over it. ``choice``: what to send when the link is free."""
 
-    def __init__(
-        self, rate_bps: float, epoch: int, next_message: Callable[[int, int], tuple[Hashable, bytes] | None]
-    ) -> None:
+    def __init__(self, rate_bps: float, epoch: int, choice: OutgoingBulk) -> None:
         self._ns_per_byte = 8e9 / rate_bps
         self._budget_bytes = int(BUDGET_SHARE * rate_bps / 8)
         self._chunk_bytes = int(min(max(rate_bps / 8 * CHUNK_HOLDS_S, CHUNK_LEAST_BYTES), CHUNK_MAX_BYTES))
         self._epoch = epoch
-        self._next_message = next_message
+        self._choice = choice
         self._ids, self._sequences = itertools.count(), itertools.count()
-        self._message: tuple[Hashable, OutgoingMessage] | None = None
+        self._messages: list[tuple[Outgoing, OutgoingMessage]] = []  # begun: at most a pose, and what is urgent
         self._under_way: tuple[Hashable, bytes] | None = None  # a chunk, through at _free_ns
         self._free_ns = 0.0
 
@@ -57,17 +55,26 @@ class PacedBulk:
                 return
 
     def _begin_chunk(self) -> bool:
-        if self._message is None:
-            chosen = self._next_message(self._budget_bytes, int(self._free_ns))
-            if chosen is None:
-                return False
-            self._message = chosen[0], OutgoingMessage(next(self._ids), chosen[1])
-        name, message = self._message
+        self._begin_message()
+        if not self._messages:
+            return False
+        chosen, message = self._messages[-1]
         sequence = next(self._sequences)
         blocks = message.take(self._chunk_bytes)
         data = message.chunk(blocks, self._epoch, sequence, sequence, int(self._free_ns))
-        self._under_way = name, data
+        self._under_way = chosen.name, data
         self._free_ns += len(data) * self._ns_per_byte
         if message.all_sent:
-            self._message = None
+            self._messages.pop()
         return True
+
+    def _begin_message(self) -> None:
+        if self._messages and self._messages[-1][0].urgent:
+            return
+        new = (
+            self._choice.next_urgent()
+            if self._messages
+            else self._choice.next_message(self._budget_bytes, int(self._free_ns))
+        )
+        if new is not None:
+            self._messages.append((new, OutgoingMessage(next(self._ids), new.payload)))

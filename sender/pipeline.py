@@ -1,6 +1,7 @@
 """The sender on one page: from a set of depth frames to a skeleton packet, and, behind it, to candidate poses.
 
-The two paths are DISPOSE Fig. 1: ``SkeletonPath`` runs for every frame and never waits for ``CandidatePath``.
+The two paths are DISPOSE Fig. 1: ``SkeletonPath`` runs for every frame and never waits for ``CandidatePath``, nor for
+the third layer, ``ResidualPath`` (``residual_path.py``).
 """
 
 from __future__ import annotations
@@ -52,7 +53,8 @@ class StreamIdentity:
 class TrackedFrame:
     """One frame set after the fast path. ``packet`` is None while nobody has been found. ``body``: a new body message
     to publish before the packet. ``skeleton``, ``pose``: as the receiver will decode them; ``T_world_link`` (L, 4, 4):
-    their forward kinematics. ``complete``: no camera's frame was missing."""
+    their forward kinematics. ``complete``: no camera's frame was missing. ``sequence``, ``body_revision``: the
+    packet's."""
 
     capture_ns: int
     views: tuple[View, ...]
@@ -63,6 +65,8 @@ class TrackedFrame:
     pose: SkeletonPose | None = None
     T_world_link: NDArray[np.float32] | None = None
     complete: bool = True
+    sequence: int = 0
+    body_revision: int = 0
 
 
 class SkeletonPath:
@@ -143,12 +147,14 @@ class SkeletonPath:
                 send_delay_ns=self._clock.now_ns() - capture_ns,
             )
         )
-        self._sequence += 1
+        sequence, self._sequence = self._sequence, self._sequence + 1
         self._previous = (capture_ns, fit.pose)
         T_world_link = forward_kinematics(body, pose)
         self._last_joints = T_world_link[:, :3, 3] if fit.confidence > 0 else None
         complete = None not in frames.frames
-        return TrackedFrame(capture_ns, views, fit, packet, message, body, pose, T_world_link, complete)
+        return TrackedFrame(
+            capture_ns, views, fit, packet, message, body, pose, T_world_link, complete, sequence, self._revision
+        )
 
     def _current_body(self, found: Skeleton) -> tuple[Skeleton, bytes | None]:
         """The body the receiver holds, and the message that tells it when it changed."""

@@ -1,4 +1,5 @@
-"""Who is receiving: one bulk window and one bulk sender for each, fed by the one mesh scheduler."""
+"""Who is receiving: one bulk window and one bulk sender for each, fed by the one mesh scheduler and, where the
+receiver wants them, with residual packets."""
 
 from __future__ import annotations
 
@@ -15,10 +16,11 @@ from common.transport.channel_publisher import ChannelPublisher
 from common.transport.channel_query import Question
 from common.transport.channel_subscriber import Arrival
 from common.transport.channels import receiver_of
-from common.wire.receiver_report import decode_report
+from common.wire.receiver_report import WANTS_RESIDUALS, decode_report
 from common.wire.repository_list import RepositoryList, decode_repository_list, encode_repository_list
 from sender.candidate_poses.mesh_scheduler import MeshScheduler, SendRecord
-from sender.outgoing_bulk import OutgoingBulk, pose_name, poses_in
+from sender.outgoing_bulk import Outgoing, OutgoingBulk, pose_name, poses_in
+from sender.residual_path import Residual
 
 log = logging.getLogger(__name__)
 
@@ -36,6 +38,7 @@ class ReceiverLink:
     name: str
     receiver_epoch: int
     publisher: ChannelPublisher
+    choice: OutgoingBulk
     bulk: BulkSender
     task: asyncio.Task[None]
     heard_ns: int
@@ -58,13 +61,16 @@ class ReceiverLinks:
         open_publisher: Callable[[str], ChannelPublisher],
         on_sent: Callable[[SendRecord], None],
         clock: Clock,
+        residual_share: float = 0.5,
     ) -> None:
         self.counts: Counter[str] = Counter()
         self.delivered_poses = 0
+        self._residual_counts: Counter[str] = Counter()  # of links that are closed
         self._epoch = epoch
         self._scheduler = scheduler
         self._open_publisher = open_publisher
         self._on_sent = on_sent
+        self._residual_share = residual_share
         self._clock = clock
         self._links: dict[str, ReceiverLink] = {}
         self._group: asyncio.TaskGroup | None = None
@@ -102,6 +108,28 @@ class ReceiverLinks:
                 log.debug("pose %d is on its way to %s no more: superseded", pose_id, link.name)
             link.bulk.wake()
 
+    def residual_bytes_s(self) -> float | None:
+        """What residual packets may take, on the thinnest link to a receiver that wants them; None: nobody does."""
+        now_ns = self._clock.now_ns()
+        wanting = [link for link in self.links if link.choice.wants_residuals]
+        allowed = (link.choice.residual_bytes_s(link.bulk.window.allowed_bytes_s, now_ns) for link in wanting)
+        return min(allowed, default=None)
+
+    @property
+    def lacks_residual_key(self) -> bool:
+        """Somebody who wants residual packets can use none before a key."""
+        return any(link.choice.needs_key for link in self.links)
+
+    def offer_residual(self, residual: Residual) -> None:
+        """The newest residual packet, for whoever wants it."""
+        for link in self.links:
+            link.choice.offer(residual)
+            link.bulk.wake()
+
+    def residual_counts(self) -> Counter[str]:
+        """Residual packets and bytes sent, packets dropped, of all links so far."""
+        return sum((link.choice.counts for link in self._links.values()), self._residual_counts)
+
     def on_report(self, arrival: Arrival) -> None:
         """A report arrived.
 
@@ -120,6 +148,7 @@ class ReceiverLinks:
             self.counts["back"] += 1
             log.info("receiver %s is back", link.name)
         link.heard_ns = arrival.arrival_ns
+        link.choice.wants_residuals = bool(report.wants & WANTS_RESIDUALS)
         link.bulk.on_report(report)
 
     def on_repository(self, question: Question) -> bytes:
@@ -156,22 +185,25 @@ class ReceiverLinks:
         publisher = self._open_publisher(name)
         self._scheduler.receiver_joined(name, receiver_epoch)
 
-        choice = OutgoingBulk(name, self._scheduler, self._on_sent)
+        choice = OutgoingBulk(name, self._scheduler, self._on_sent, self._residual_share)
 
         def next_message(budget_bytes: int) -> BulkMessage | None:
             now_ns = self._clock.now_ns()
             if now_ns < self._links[name].list_due_ns:
-                return None
-            chosen = choice.next_message(budget_bytes * 1_000_000_000 // PERIOD_NS, now_ns)
-            return None if chosen is None else BulkMessage(*chosen)
+                return next_urgent()
+            return _message(choice.next_message(budget_bytes * 1_000_000_000 // PERIOD_NS, now_ns))
+
+        def next_urgent() -> BulkMessage | None:
+            return _message(choice.next_urgent())
 
         def delivered(message: Hashable) -> None:
-            self.delivered_poses += 1
+            self.delivered_poses += isinstance(message, tuple) and message[0] == "pose"
             log.debug("%s delivered to %s", message, name)
 
-        bulk = BulkSender(publisher, BulkWindow(self._epoch), self._epoch, next_message, delivered, self._clock)
+        window = BulkWindow(self._epoch)
+        bulk = BulkSender(publisher, window, self._epoch, next_message, delivered, self._clock, next_urgent)
         task = self._group.create_task(bulk.run(), name=f"bulk to {name}")
-        link = ReceiverLink(name, receiver_epoch, publisher, bulk, task, self._clock.now_ns())
+        link = ReceiverLink(name, receiver_epoch, publisher, choice, bulk, task, self._clock.now_ns())
         self._links[name] = link
         self.counts["opened"] += 1
         log.info("receiver %s joined", name)
@@ -182,5 +214,12 @@ class ReceiverLinks:
         link.task.cancel()
         link.publisher.close()
         self._scheduler.receiver_left(link.name)
+        self._residual_counts += link.choice.counts
         self.counts["closed"] += 1
         log.info("receiver %s left: %s", link.name, why)
+
+
+def _message(chosen: Outgoing | None) -> BulkMessage | None:
+    if chosen is None:
+        return None
+    return BulkMessage(chosen.name, chosen.payload, chosen.supersedes, chosen.urgent)

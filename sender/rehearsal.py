@@ -14,10 +14,11 @@ from common.geometry.camera_model import Camera
 from common.geometry.point_cloud import PointCloud
 from common.runtime.clock import MonotonicClock
 from common.runtime.stage_timer import StageTimer
+from common.wire.body_message import quantized_skeleton
 from sender.capture.frame_set import ColourFrame, DepthFrame, FrameSet
 from sender.capture.outside_skeleton import OutsideSkeleton, Sensor
 from sender.capture.rig_layout import cameras_around
-from sender.config import CandidateSettings
+from sender.config import CandidateSettings, ResidualStreamSettings
 from sender.fitting.articulated_gauss_newton import PoseState
 from sender.fitting.body_fitter import BodyFitter
 from sender.fitting.body_model import BodyModel
@@ -33,6 +34,7 @@ from sender.fitting.tracker import FitResult
 from sender.pipeline import CandidatePath, SkeletonPath, StreamIdentity, TrackedFrame
 from sender.reconstruction.foreground_points import PointSampler
 from sender.reconstruction.person_points import DepthReconstruction, HullReconstruction
+from sender.residual_path import ResidualPath
 
 FRAME_NS = 33_333_333
 _IDENTITY = StreamIdentity(0, 0)
@@ -122,6 +124,20 @@ def rehearse_candidates() -> None:
         candidates.process(later)
 
 
+def rehearse_residuals() -> None:
+    """Make residual packets of a mannequin: a key, and a difference from it."""
+    body, pose = mannequin()
+    camera, skeleton = mannequin_camera(), quantized_skeleton(body)
+    path = ResidualPath(_IDENTITY, [camera], 30.0, ResidualStreamSettings(), StageTimer(MonotonicClock()))
+    path.note_budget(1e6)
+    for index in range(2):
+        T_world_link = forward_kinematics(skeleton, pose)
+        views = (_view(camera),)
+        path.process(
+            TrackedFrame(index * FRAME_NS, views, None, skeleton=skeleton, pose=pose, T_world_link=T_world_link)
+        )
+
+
 def rehearse_skeletons() -> None:
     """Turn a skeleton of a sensor's own into ours."""
     skeleton, pose = mannequin()
@@ -131,13 +147,19 @@ def rehearse_skeletons() -> None:
         tracker.track((OutsideSkeleton(index * FRAME_NS, 0, joints, np.ones(len(joints), np.float32)),))
 
 
+def rehearse_slow_paths() -> None:
+    """What goes on beside the skeletons."""
+    rehearse_candidates()
+    rehearse_residuals()
+
+
 def rehearse_all() -> None:
     """What a sender does from the first frame on."""
     rehearse_fitting()
     rehearse_recovery()
     rehearse_skeletons()
     rehearse_hull()
-    rehearse_candidates()
+    rehearse_slow_paths()
 
 
 def _view(camera: Camera) -> View:

@@ -22,8 +22,9 @@ from sender.config import SenderSettings
 from sender.fitting.open_tracker import open_tracker
 from sender.open_path import open_skeleton_path, open_synchronizer, outside_tracker
 from sender.outgoing_bulk import OutgoingBulk
-from sender.paced_bulk import PacedBulk
-from sender.pipeline import CandidatePath, StreamIdentity
+from sender.paced_bulk import BUDGET_SHARE, PacedBulk
+from sender.pipeline import CandidatePath, StreamIdentity, TrackedFrame
+from sender.residual_path import ResidualPath
 
 RECEIVER = "session"  # whom the bulk in the file is addressed to
 EPOCH = 1  # a file holds one run, and the same one whenever it is encoded
@@ -32,13 +33,16 @@ RAW_DEPTH_BYTES, RAW_COLOUR_BYTES = 2, 3  # a pixel (Lien §6 counts five)
 
 @dataclass(slots=True)
 class EncodedAmount:
-    """What went in and came out so far. ``raw_bytes``: of all images; ``layer_bytes``: payloads by layer."""
+    """What went in and came out so far. ``residuals``: packets made, at levels [%] of ``level_sum`` in all;
+    ``raw_bytes``: of all images; ``layer_bytes``: payloads by layer."""
 
     first_ns: int | None = None
     last_ns: int = 0
     frame_sets: int = 0
     skeletons: int = 0
     poses: int = 0
+    residuals: int = 0
+    level_sum: float = 0.0
     raw_bytes: int = 0
     layer_bytes: Counter[str] = field(default_factory=Counter)
 
@@ -64,8 +68,11 @@ class SessionEncoder:
         self._pace = CandidatePace(int(settings.poses.interval_ms * 1e6), settings.poses.busy_share)
         self._scheduler = MeshScheduler()
         self._scheduler.receiver_joined(RECEIVER, EPOCH)
-        bulk = OutgoingBulk(RECEIVER, self._scheduler, self._on_sent)
-        self._bulk = PacedBulk(rate_bps, EPOCH, bulk.next_message)
+        self._choice = OutgoingBulk(RECEIVER, self._scheduler, self._on_sent, settings.residuals.share)
+        self._choice.wants_residuals = settings.residuals.mode == "auto"
+        self._residuals = ResidualPath(identity, source.cameras, source.frame_rate_hz, settings.residuals, timer)
+        self._bulk_bytes_s = BUDGET_SHARE * rate_bps / 8
+        self._bulk = PacedBulk(rate_bps, EPOCH, self._choice)
 
     def process(self, frames: FrameSet) -> Iterator[StoredMessage]:
         """The messages up to the instant of ``frames``, and those it leads to, in order of time."""
@@ -83,8 +90,14 @@ class SessionEncoder:
         self.amount.skeletons += 1
         self._bulk.occupy(len(tracked.packet), now_ns)
         yield self._message(channels.SKELETON, now_ns, tracked.packet, "skeleton")
-        if not self._settings.poses.enabled:
-            return
+        if self._settings.poses.enabled:
+            self._consider(tracked)
+        if self._choice.wants_residuals:
+            self._code_residuals(tracked)
+
+    def _consider(self, tracked: TrackedFrame) -> None:
+        """The frame may become a candidate pose."""
+        now_ns = tracked.capture_ns
         self._candidates.remember(tracked)
         if self._pace.due(now_ns, now_ns) and self._candidates.may_become_one(tracked):
             self._pace.begin(now_ns, now_ns)
@@ -92,6 +105,16 @@ class SessionEncoder:
             found = self._candidates.process(tracked)
             self._scheduler.offer(found.pose_id, found.encoded, found.capture_ns, found.worth, found.preview)
             self._pace.done(0)
+
+    def _code_residuals(self, tracked: TrackedFrame) -> None:
+        self._residuals.note_budget(self._choice.residual_bytes_s(self._bulk_bytes_s, tracked.capture_ns))
+        if self._choice.needs_key:
+            self._residuals.request_key()
+        residual = self._residuals.process(tracked)
+        if residual is not None:
+            self.amount.level_sum += residual.level
+            self.amount.residuals += 1
+            self._choice.offer(residual)
 
     def _message(
         self, channel: Channel, time_ns: int, payload: bytes, layer: str, receiver: str | None = None

@@ -73,11 +73,17 @@ class Bench:
         self.to_send = [BulkMessage(i, payload) for i, payload in enumerate(payloads)]
         self.reports = True
         clock = MonotonicClock()
-        self.sender = BulkSender(far, BulkWindow(EPOCH), EPOCH, self.next_message, self.delivered.append, clock)
+        self.urgent: list[BulkMessage] = []
+        self.sender = BulkSender(
+            far, BulkWindow(EPOCH), EPOCH, self.next_message, self.delivered.append, clock, self.next_urgent
+        )
 
     def next_message(self, budget_bytes: int) -> BulkMessage | None:
         self.budgets.append(budget_bytes)
         return self.to_send.pop(0) if self.to_send else None
+
+    def next_urgent(self) -> BulkMessage | None:
+        return self.urgent.pop(0) if self.urgent else None
 
     @asynccontextmanager
     async def running(self) -> AsyncIterator[None]:
@@ -197,3 +203,29 @@ async def test_a_name_under_way_cannot_be_used_again() -> None:
     bench.sender.on_report(bench.far.report(0))
     with pytest.raises(ValueError, match="'same' is under way"):
         await asyncio.wait_for(bench.sender.run(), WITHIN_S)
+
+
+async def test_what_is_urgent_goes_between_the_chunks_of_what_is_not():
+    bench = Bench(Far(), [noise(1_000_000, 1)])
+    async with bench.running():
+        await until(lambda: len(bench.far.sizes) > 2)
+        bench.urgent = [BulkMessage(("map", i), noise(5_000, i), urgent=True) for i in range(3)]
+        await bench.until_delivered(4)
+    assert bench.delivered == [("map", 0), ("map", 1), ("map", 2), 0]
+    assert bench.far.messages == [noise(5_000, 0), noise(5_000, 1), noise(5_000, 2), noise(1_000_000, 1)]
+
+
+async def test_what_is_superseded_is_sent_no_more_not_even_what_was_lost_of_it():
+    bench = Bench(Far(), [])
+    bench.far.loss = 1.0
+    bench.to_send = [BulkMessage("old", noise(8_000, 1), urgent=True)]
+    async with bench.running():
+        await until(lambda: len(bench.far.sizes) >= 2)
+        bench.to_send = [BulkMessage("new", noise(9_000, 2), supersedes="old", urgent=True)]
+        bench.sender.wake()
+        await until(lambda: "new" in bench.sender.under_way)
+        assert bench.sender.under_way == ("new",)
+        bench.far.loss = 0.0
+        await bench.until_delivered(1)
+    assert bench.delivered == ["new"]
+    assert bench.far.messages == [noise(9_000, 2)]

@@ -16,6 +16,7 @@ from common.wire.receiver_report import (
     MAX_MISSING_CHUNKS,
     MISSING_SPAN,
     REPORT_MAX_BYTES,
+    WANTS_RESIDUALS,
     ReceiverReport,
     decode_report,
     encode_report,
@@ -38,6 +39,7 @@ REPORT = ReceiverReport(
     missing_chunks=(3, 480, 499),
     body_revision=2,
     repository_poses=42,
+    wants=WANTS_RESIDUALS,
 )
 SILENT = replace(
     REPORT, sender_epoch=None, skeleton_send_ns=None, skeleton_delay_ns=None, bulk_delay_ns=None, body_revision=None
@@ -57,6 +59,7 @@ LONGEST = ReceiverReport(
     missing_chunks=tuple(2**53 - MISSING_SPAN + i for i in range(MAX_MISSING_CHUNKS)),
     body_revision=255,
     repository_poses=0xFFFF,
+    wants=255,
 )
 
 
@@ -250,6 +253,6 @@ def test_empty_oversized_and_foreign_reports_are_refused() -> None:
 
 def test_the_golden_report_decodes_to_known_values_and_is_what_we_encode() -> None:
     golden = bytes.fromhex(GOLDEN.read_text())
-    expected = (1, 2, 3, 4, 5_000_000_000, 6_000_000_000, 7_000_000, -8_000_000, None, 9_000, 100, (97, 99), 1, 12)
+    expected = (1, 2, 3, 4, 5_000_000_000, 6_000_000_000, 7_000_000, -8_000_000, None, 9_000, 100, (97, 99), 1, 12, 1)
     assert astuple(decode_report(golden)) == expected
     assert encode_report(ReceiverReport(*expected)) == golden

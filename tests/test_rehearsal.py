@@ -13,6 +13,7 @@ from sender.fitting.body_model import _sheet
 from sender.fitting.gauss_newton_tracker import GaussNewtonTracker
 from sender.fitting.limb_search import score_poses
 from sender.pipeline import CandidatePath
+from sender.residual_path import ResidualPath
 
 
 def test_the_mannequin_stands_in_the_picture_around_its_joints():
@@ -53,6 +54,19 @@ def test_candidates_are_rehearsed_with_a_mesh_in_the_set(monkeypatch):
     monkeypatch.setattr(CandidatePath, "process", watched)
     sending.rehearse_candidates()
     assert [len(f.encoded) > 1000 for f in found] == [True, True]
+
+
+def test_residual_maps_are_rehearsed_as_key_and_difference(monkeypatch):
+    found = []
+    process = ResidualPath.process
+
+    def watched(self, tracked):
+        found.append(process(self, tracked))
+        return found[-1]
+
+    monkeypatch.setattr(ResidualPath, "process", watched)
+    sending.rehearse_residuals()
+    assert [(residual.sequence, residual.key) for residual in found] == [(0, 0), (1, 0)]
 
 
 def test_the_receivers_rehearsal_shows_a_mesh(monkeypatch):

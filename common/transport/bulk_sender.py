@@ -31,17 +31,21 @@ class Publisher(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class BulkMessage:
-    """What to send, and the name by which it is cancelled and its delivery told."""
+    """What to send, and the name by which it is cancelled and its delivery told. ``supersedes``: the name of an earlier
+    one that is worth nothing any more. ``urgent``: its chunks go before those of messages that are not."""
 
     name: Hashable
     payload: bytes
+    supersedes: Hashable | None = None
+    urgent: bool = False
 
 
 class BulkSender:
     """One receiver's bulk. ``next_message(budget_bytes)`` is asked for more when all else is on its way.
 
-    It may return None; ``wake`` when there is something again. ``on_delivered(name)`` tells that all of a message
-    has arrived. ``chunks``, ``chunk_bytes``, ``repeated``: what was sent so far, and how much of it again.
+    It may return None; ``wake`` when there is something again. ``next_urgent()`` is asked between the chunks of
+    messages that are not urgent. ``on_delivered(name)`` tells that all of a message has arrived. ``chunks``,
+    ``chunk_bytes``, ``repeated``: what was sent so far, and how much of it again.
     """
 
     def __init__(
@@ -52,6 +56,7 @@ class BulkSender:
         next_message: Callable[[int], BulkMessage | None],
         on_delivered: Callable[[Hashable], None],
         clock: Clock,
+        next_urgent: Callable[[], BulkMessage | None] = lambda: None,
     ) -> None:
         self.chunks = 0
         self.chunk_bytes = 0
@@ -60,10 +65,12 @@ class BulkSender:
         self._publisher = publisher
         self._epoch = epoch
         self._next_message = next_message
+        self._next_urgent = next_urgent
         self._on_delivered = on_delivered
         self._clock = clock
         self._ids = itertools.count()
         self._under_way: dict[Hashable, OutgoingMessage] = {}  # in the order they began
+        self._urgent: set[Hashable] = set()  # of those under way
         self._in_flight: dict[int, tuple[Hashable, OutgoingMessage, range]] = {}  # by sequence number
         self._changed = asyncio.Event()
 
@@ -83,6 +90,7 @@ class BulkSender:
 
     def cancel(self, name: Hashable) -> bool:
         """Send nothing more of a message, because a better one supersedes it; False when it is not under way."""
+        self._urgent.discard(name)
         return self._under_way.pop(name, None) is not None
 
     async def run(self) -> None:
@@ -118,16 +126,23 @@ class BulkSender:
 
     def _choose(self) -> tuple[Hashable, OutgoingMessage] | None:
         """The message whose chunk goes next."""
-        for name, message in self._under_way.items():
-            if not message.all_sent:
-                return name, message
-        if len(self._under_way) >= UNDER_WAY_MAX:
-            return None
-        new = self._next_message(self.window.budget_bytes(PERIOD_NS))
-        if new is None:
-            return None
+        unsent = [(name, message) for name, message in self._under_way.items() if not message.all_sent]
+        urgent = next((one for one in unsent if one[0] in self._urgent), None)
+        if urgent is not None:
+            return urgent
+        if len(self._under_way) < UNDER_WAY_MAX:
+            new = self._next_urgent() if unsent else self._next_message(self.window.budget_bytes(PERIOD_NS))
+            if new is not None:
+                return self._begin(new)
+        return unsent[0] if unsent else None
+
+    def _begin(self, new: BulkMessage) -> tuple[Hashable, OutgoingMessage]:
         if new.name in self._under_way:
             raise ValueError(f"message {new.name!r} is under way already")
+        if new.supersedes is not None:
+            self.cancel(new.supersedes)
+        if new.urgent:
+            self._urgent.add(new.name)
         message = self._under_way[new.name] = OutgoingMessage(next(self._ids), new.payload)
         return new.name, message
 
@@ -157,5 +172,5 @@ class BulkSender:
             name, message, blocks = self._in_flight.pop(sequence)
             message.arrived(blocks)
             if message.all_arrived and self._under_way.get(name) is message:
-                del self._under_way[name]
+                self.cancel(name)
                 self._on_delivered(name)

@@ -115,6 +115,13 @@ class BulkWindow:
         return statistics.median(self._rates)
 
     @property
+    def allowed_bytes_s(self) -> float:
+        """What the window lets through [bytes/s]; more than ``rate_bytes_s`` while it seeks how much the path takes.
+
+        For streams that adapt to it: were they to follow what they sent themselves, they would never send more."""
+        return self._window / (self._path.round_trip_s + self._period_s)
+
+    @property
     def chunk_bytes(self) -> int:
         """C: how large a chunk should be now."""
         return int(min(max(self.rate_bytes_s * CHUNK_HOLDS_S, CHUNK_LEAST_BYTES), CHUNK_MAX_BYTES))

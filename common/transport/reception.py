@@ -35,7 +35,7 @@ class Reception:
         self._arrivals.note(chunk, size)
         self._bulk_delay.note(chunk.send_ns, arrival_ns)
 
-    def report(self, now_ns: int, body_revision: int | None, repository_poses: int) -> ReceiverReport:
+    def report(self, now_ns: int, body_revision: int | None, repository_poses: int, wants: int = 0) -> ReceiverReport:
         """The next report; delays in it are those since the one before."""
         self._number += 1
         next_chunk, missing = self._arrivals.resolved()
@@ -54,4 +54,5 @@ class Reception:
             missing_chunks=missing,
             body_revision=body_revision,
             repository_poses=repository_poses,
+            wants=wants,
         )

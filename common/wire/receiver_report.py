@@ -22,6 +22,7 @@ from common.wire.header import (
 
 REPORT_MAX_BYTES = 1024
 MAX_MISSING_CHUNKS = 128
+WANTS_RESIDUALS = 1  # a bit of ``wants``
 MISSING_SPAN = 0xFFFF  # a missing chunk lies at most this far below the next expected one
 REPOSITORY_MAX_POSES = 0xFFFF
 
@@ -43,6 +44,7 @@ class ReceiverReport:
     ``next_chunk``: every chunk below is resolved or in ``missing_chunks`` (rising); with more missing than
     ``MAX_MISSING_CHUNKS`` it is the first one not listed.
     ``body_revision``: of the newest body message held, None: none. ``repository_poses``: candidate poses held.
+    ``wants``: bits, what it has a use for beside candidate poses; bits unknown here mean nothing.
     """
 
     number: int
@@ -59,6 +61,7 @@ class ReceiverReport:
     missing_chunks: tuple[int, ...]
     body_revision: int | None
     repository_poses: int
+    wants: int = 0
 
 
 _FIELD_NAMES = [field.name for field in fields(ReceiverReport)]
@@ -76,6 +79,7 @@ _RANGES = {
     "next_chunk": (0, _COUNT_MAX),
     "body_revision": (0, U8_MAX),
     "repository_poses": (0, REPOSITORY_MAX_POSES),
+    "wants": (0, U8_MAX),
 }
 _OPTIONAL = {"sender_epoch", "skeleton_send_ns", "skeleton_delay_ns", "bulk_delay_ns", "body_revision"}
 

@@ -115,6 +115,11 @@ def encode_residual(header: ResidualHeader, layout: MapLayout, maps: LinkMaps, r
     return data
 
 
+def is_residual(message: bytes) -> bool:
+    """Whether a bulk message claims to be a residual packet."""
+    return message[:1] == bytes([RESIDUAL_VERSION])
+
+
 def decode_residual_header(data: bytes) -> ResidualHeader:
     """What the packet says of itself; the checksum is checked.
 

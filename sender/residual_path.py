@@ -1,0 +1,99 @@
+"""The third layer: every frame's points → residual packets, at the level that bandwidth allows (Lien §5.2).
+
+Behind the fast path as candidate poses are, on a thread of its own; a frame it has no time for is left out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from common.geometry.camera_model import Camera
+from common.runtime.stage_timer import StageTimer
+from common.wire.residual_packet import decode_residual_header
+from sender.config import ResidualStreamSettings
+from sender.pipeline import StreamIdentity, TrackedFrame
+from sender.reconstruction.foreground_points import PointSampler
+from sender.residual_encoder import LevelControl, ResidualEncoder, ResidualFrame, ResidualSettings
+
+VOXEL_M = 0.012  # of the points: a cell of the full maps
+SMOOTHING_NS = 1_000_000_000  # of the budget: each change of level costs a key
+INTERVAL_MEMORY = 0.1  # weight of the newest interval between two frames
+LONGEST_INTERVAL_NS = 500_000_000
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Residual:
+    """A packet. ``sequence`` is its number, ``key`` that of the key it needs: its own if it is one. ``level`` [%]."""
+
+    sequence: int
+    key: int
+    data: bytes
+    level: float
+
+
+class ResidualPath:
+    """``process`` is one thread's own; ``note_budget`` and ``request_key`` may be called from another."""
+
+    def __init__(
+        self,
+        identity: StreamIdentity,
+        cameras: Sequence[Camera],
+        frame_rate_hz: float,
+        settings: ResidualStreamSettings,
+        timer: StageTimer,
+    ) -> None:
+        self._sampler = PointSampler(cameras, settings.points, voxel_m=VOXEL_M)
+        self._encoder = ResidualEncoder(identity.person, identity.epoch, ResidualSettings(points=settings.points))
+        self._control = LevelControl()
+        self._timer = timer
+        self._budget_bytes_s = 0.0
+        self._interval_ns = 1e9 / frame_rate_hz
+        self._last_ns: int | None = None
+        self._smoothed: float | None = None
+        self._key_wanted = False
+
+    def note_budget(self, bytes_per_s: float) -> None:
+        """What residuals may take."""
+        self._budget_bytes_s = bytes_per_s
+
+    def request_key(self) -> None:
+        """Somebody has none."""
+        self._key_wanted = True
+
+    def process(self, tracked: TrackedFrame) -> Residual | None:
+        """The packet of a frame; None where nobody is seen, or the level is 0 and the model is out."""
+        if not tracked.views or tracked.skeleton is None or tracked.T_world_link is None:
+            return None
+        level = self._control.level(self._budget(tracked.capture_ns) * self._interval_ns / 1e9)
+        if self._key_wanted:
+            self._key_wanted = False
+            self._encoder.request_key()
+        with self._timer.stage("residual points"):
+            cloud = self._sampler.points(tracked.views)
+        with self._timer.stage("residual maps"):
+            frame = ResidualFrame(
+                tracked.skeleton,
+                tracked.body_revision,
+                tracked.T_world_link,
+                tracked.sequence,
+                tracked.capture_ns,
+                cloud,
+            )
+            data = self._encoder.encode(frame, level)
+        if data is None:
+            return None
+        header = decode_residual_header(data)
+        self._control.coded(header.level, len(data))
+        return Residual(header.sequence, header.reference, data, header.level)
+
+    def _budget(self, capture_ns: int) -> float:
+        """The smoothed budget; takes note of how often frames come."""
+        if self._last_ns is None or self._smoothed is None:
+            self._last_ns, self._smoothed = capture_ns, self._budget_bytes_s
+            return self._smoothed
+        passed_ns = min(max(capture_ns - self._last_ns, 0), LONGEST_INTERVAL_NS)
+        self._last_ns = capture_ns
+        self._interval_ns += INTERVAL_MEMORY * (passed_ns - self._interval_ns)
+        self._smoothed += (self._budget_bytes_s - self._smoothed) * min(passed_ns / SMOOTHING_NS, 1.0)
+        return self._smoothed
