@@ -53,7 +53,14 @@ DRACO_LADDER = tuple(
 
 
 def yang(views: Sequence[View], rung: Rung) -> tuple[int, Callable[[], TriangleMesh]]:
-    """Bytes of the views, and the surface on the other end. Depth: differences along the rows by zlib."""
+    """Bytes of the views, and the surface on the other end."""
+    size, decoded = yang_views(views, rung)
+    stride = MESH_STRIDE if rung.step == 1 else 1
+    return size, lambda: surface_of(decoded, stride, DRAWN_EDGE_M * max(1, rung.step / 3))
+
+
+def yang_views(views: Sequence[View], rung: Rung) -> tuple[int, list[View]]:
+    """Bytes of the views, and the views on the other end. Depth: differences along the rows by zlib."""
     size = 0
     decoded = []
     for view in (reduced(view, rung.step) for view in views):
@@ -62,8 +69,7 @@ def yang(views: Sequence[View], rung: Rung) -> tuple[int, Callable[[], TriangleM
         jpeg, colour = _jpeg(_filled(view.colour, steps > 0), rung.quality)
         size += jpeg
         decoded.append(replace(view, depth_mm=np.asarray(steps * rung.depth, np.uint16), colour=colour))
-    stride = MESH_STRIDE if rung.step == 1 else 1
-    return size, lambda: surface_of(decoded, stride, DRAWN_EDGE_M * max(1, rung.step / 3))
+    return size, decoded
 
 
 def draco(views: Sequence[View], rung: Rung) -> tuple[int, Callable[[], TriangleMesh]]:

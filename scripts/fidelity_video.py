@@ -1,10 +1,10 @@
-"""The strong rival's coder: all cameras' colour and depth as two H.265 videos of a fixed bit rate, and silhouettes.
+"""The strong rival's coder: all cameras' colour and depth as two videos of a fixed bit rate, and silhouettes.
 
 Each camera's window, the part of its image where the person ever is, is a tile of one picture. Beyond the silhouette
 colour and depth (10 bits) go on as the mean of what is near, so that no edge costs bits; the silhouette itself is sent
 by zlib without loss, as a depth that is cut by a lossy one loses two decibels. No B-frames and no look-ahead, one key
 frame at the start. The motion is coded once; a session that repeats it repeats the pictures, too, which spares the
-video the cut.
+video the cut. Other coders than real-time H.265 are for the residuals bench.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import lru_cache
-from typing import Any
+from typing import Any, Protocol
 
 import cv2
 import numpy as np
@@ -22,14 +22,27 @@ from numpy.typing import NDArray
 
 from common.body.view import View
 from common.geometry.camera_model import Camera
-from scripts.fidelity_capture import FRAME_RATE_HZ, Capture
+from scripts.fidelity_capture import FRAME_RATE_HZ
 
-PRESET = "superfast"
 DEPTH_SHARE = 0.5  # of the bits
 BUFFER_S = 0.2  # a picture may be so much larger than its share
 _MAX_10_BIT = 1023
 EDGE_MM = 100  # of depth within a pixel or two: two surfaces
 _MARGIN_MM = 50  # of the depths that can be coded around those looked at
+
+
+@dataclass(frozen=True, slots=True)
+class VideoCoder:
+    """FFmpeg's names of ``encoder``, its ``preset`` and the ``decoder``. ``live``: no picture waits for a later one,
+    and none is much larger than its share; else the encoder looks ahead, and only the whole keeps to the rate."""
+
+    encoder: str
+    decoder: str
+    preset: str
+    live: bool = True
+
+
+H265_LIVE = VideoCoder("libx265", "hevc", "superfast")
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,8 +96,23 @@ class CodedVideo:
     views: dict[int, tuple[View, ...]]
 
 
+class Filmed(Protocol):
+    """What a video is made of: frames from 0 to ``length``, as a ``Capture`` has them."""
+
+    @property
+    def length(self) -> int: ...
+    def frame(self, k: int, /) -> Seen: ...
+
+
+class Seen(Protocol):
+    """One frame, of which only the views count."""
+
+    @property
+    def views(self) -> tuple[View, ...]: ...
+
+
 @lru_cache(maxsize=2)
-def coded_video(recorded: Capture, rate_bps: float, rung: VideoRung) -> CodedVideo:
+def coded_video(recorded: Filmed, rate_bps: float, rung: VideoRung, coder: VideoCoder = H265_LIVE) -> CodedVideo:
     """The whole motion at a bit rate, coded and decoded."""
     windows = _windows(recorded, rung.step)
     indices = [k for k in range(recorded.length) if k % rung.every == 0 and recorded.frame(k).views]
@@ -96,15 +124,17 @@ def coded_video(recorded: Capture, rate_bps: float, rung: VideoRung) -> CodedVid
     silhouettes = [_silhouette(_packed(recorded.frame(k).views, windows, size)[1] > 0, rung.step) for k in indices]
     silhouette_bps = sum(map(len, silhouettes)) / len(silhouettes) * 8 * fps
     video_bps = max(rate_bps - silhouette_bps, rate_bps / 4)
-    colours = _Stream(size, rung.step, f"yuv{rung.chroma}p", fps, video_bps * (1 - DEPTH_SHARE))
-    depths = _Stream(size, rung.step, "gray10le", fps, video_bps * DEPTH_SHARE)
+    colours = _Stream(size, rung.step, f"yuv{rung.chroma}p", fps, video_bps * (1 - DEPTH_SHARE), coder)
+    depths = _Stream(size, rung.step, "gray10le", fps, video_bps * DEPTH_SHARE, coder)
     for k in indices:
         colour, depth_mm = _packed(recorded.frame(k).views, windows, size)
         colours.code(_colour_planes(colour, depth_mm > 0))
         depths.code([_carried_on((depth_mm[..., None] - near) / step_mm, depth_mm > 0)[..., 0]])
     bytes_each = zip(colours.sizes(), depths.sizes(), map(len, silhouettes), strict=True)
     views = {}
-    for k, (y, cb, cr), (luma,), coded in zip(indices, colours.decoded(), depths.decoded(), silhouettes, strict=True):
+    for k, (y, cb, cr), (luma, *_), coded in zip(
+        indices, colours.decoded(), depths.decoded(), silhouettes, strict=True
+    ):
         rgb = np.asarray(cv2.cvtColor(cv2.merge([y, cr, cb]), cv2.COLOR_YCrCb2RGB), np.uint8)
         seen = _seen(coded, size, rung.step)
         luma = _sharpened(luma, EDGE_MM / step_mm, rung.step)
@@ -136,7 +166,7 @@ def _seen(coded: bytes, size: tuple[int, int], step: int) -> NDArray[np.bool_]:
     return np.asarray(cv2.resize(bits.astype(np.float32), size, interpolation=cv2.INTER_LINEAR) >= 0.5)
 
 
-def _windows(recorded: Capture, step: int) -> list[_Window]:
+def _windows(recorded: Filmed, step: int) -> list[_Window]:
     """Every camera's window, a multiple of 16 samples large, side by side."""
     boxes: dict[str, tuple[Camera, list[int]]] = {}
     for k in range(recorded.length):
@@ -205,21 +235,30 @@ def _colour_planes(colour: NDArray[np.uint8], seen: NDArray[np.bool_]) -> list[N
 
 
 class _Stream:
-    """One H.265 video of pictures ``size`` (w, h), coded at 1/``step`` of it; packets are kept."""
+    """One video of pictures ``size`` (w, h), coded at 1/``step`` of it; packets are kept."""
 
-    def __init__(self, size: tuple[int, int], step: int, pixels: str, fps: float, rate_bps: float) -> None:
+    def __init__(
+        self, size: tuple[int, int], step: int, pixels: str, fps: float, rate_bps: float, kind: VideoCoder
+    ) -> None:
         import av
 
         kbps = max(int(rate_bps / 1000), 1)
-        coder: Any = av.CodecContext.create("libx265", "w")
+        coder: Any = av.CodecContext.create(kind.encoder, "w")
         coder.width, coder.height = size[0] // step, size[1] // step
         coder.pix_fmt = pixels
         coder.framerate = Fraction(fps).limit_denominator(1000)
         coder.time_base = 1 / coder.framerate
-        rate = f"bitrate={kbps}:vbv-maxrate={kbps}:vbv-bufsize={max(int(kbps * max(BUFFER_S, 1 / fps)), 1)}"
-        single = "log-level=none:pools=none:frame-threads=1:keyint=-1:scenecut=0"
-        coder.options = {"preset": PRESET, "tune": "zerolatency", "x265-params": f"{rate}:{single}"}
+        rate = f"bitrate={kbps}"
+        if kind.live:
+            rate += f":vbv-maxrate={kbps}:vbv-bufsize={max(int(kbps * max(BUFFER_S, 1 / fps)), 1)}:scenecut=0"
+        single = "log-level=none:pools=none:frame-threads=1:keyint=-1"
+        if kind.encoder == "libx264":
+            single = "threads=1:keyint=infinite"
+        coder.options = {"preset": kind.preset, f"{kind.encoder.removeprefix('lib')}-params": f"{rate}:{single}"}
+        if kind.live:
+            coder.options |= {"tune": "zerolatency"}
         self._coder, self._size, self._pixels, self._count = coder, size, pixels, 0
+        self._decoder_name = kind.decoder
         self._packets: list[Any] = []
 
     def code(self, planes: Sequence[NDArray[np.float32]]) -> None:
@@ -247,7 +286,7 @@ class _Stream:
         """The planes of every frame as the other end has them, at full size."""
         import av
 
-        decoder: Any = av.CodecContext.create("hevc", "r")
+        decoder: Any = av.CodecContext.create(self._decoder_name, "r")
         decoder.thread_count = 1
         kind: Any = np.uint16 if "10" in self._pixels else np.uint8
         for packet in [*self._packets, None]:
