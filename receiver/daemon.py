@@ -10,9 +10,10 @@ import asyncio
 import logging
 import secrets
 from collections import Counter, deque
-from collections.abc import Callable, Coroutine
+from collections.abc import Coroutine
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 from common.body.skeleton import Skeleton
@@ -24,6 +25,7 @@ from common.runtime.http_access import read_token, tls_context
 from common.runtime.metrics import Health, Metrics, daemon_app, serve_app
 from common.runtime.run_statistics import RunStatistics, write_statistics
 from common.runtime.stage_timer import StageTimer
+from common.runtime.steady_ticks import steadily
 from common.runtime.threads import into_background
 from common.transport.access_rules import for_receiver, receiver_name
 from common.transport.link_settings import with_endpoints
@@ -119,7 +121,7 @@ class _Show:
         self._newest: SkeletonToShow | None = None
         smoothness = settings.view.smoothness
         self._jitter = JitterBuffer(smoothness) if smoothness > 0 else None  # without it the newest wins
-        self._log = ShowLog(settings.shown_log) if settings.shown_log else None
+        self._log = _open_show_log(settings.shown_log)
         self.viewer: WebViewer | HeadlessScreen = (
             HeadlessScreen(self._timer, skinning=settings.view.skinning)
             if settings.view.headless
@@ -136,9 +138,9 @@ class _Show:
         lasting: list[Coroutine[Any, Any, None]] = [
             self._animation.run(),
             self._mesh_poses(),
-            self._every(REPORT_PERIOD_S, self._report),
-            self._every(STATUS_PERIOD_S, self._tell_status),
-            self._every(1 / self._settings.view.display_hz, self._tick),
+            steadily(REPORT_PERIOD_S, self._report),
+            steadily(STATUS_PERIOD_S, self._tell_status),
+            steadily(1 / self._settings.view.display_hz, self._tick, self._on_missed_ticks),
             self._keep_time(),
             self._keep_body(),
             self._tell_what_is_here(),
@@ -269,6 +271,9 @@ class _Show:
         if isinstance(self.viewer, HeadlessScreen):
             self.viewer.tick()
 
+    def _on_missed_ticks(self, count: int) -> None:
+        self._counts["tick missed"] += count
+
     def _report(self) -> None:
         self._channels.send_report(self._state.repository_poses)
 
@@ -280,6 +285,7 @@ class _Show:
             age_ms=None if age_ns is None else age_ns / 1e6,
             skeleton_bytes=subscribers["skeleton"].arrived_bytes,
             bulk_bytes=subscribers["bulk"].arrived_bytes,
+            foreign_skeletons=self._channels.stream.skeletons.counts["old_epoch"],
         )
         self._health.ready, self._health.reason = self._state.receiving, status.connection.value
         self.viewer.set_status(status)
@@ -295,15 +301,6 @@ class _Show:
             await asyncio.sleep(BODY_PERIOD_S)
             if self._channels.stream.lacks_body:
                 await self._channels.ask_body()
-
-    async def _every(self, period_s: float, action: Callable[[], None]) -> None:
-        """Call ``action`` at a steady rate; ticks that were missed are left out."""
-        loop = asyncio.get_running_loop()
-        due_s = loop.time()
-        while True:
-            action()
-            due_s = max(due_s + period_s, loop.time())
-            await asyncio.sleep(due_s - loop.time())
 
     def _record(self, kind: str, payload: bytes | list[Any]) -> None:
         if self._log is not None:
@@ -367,6 +364,13 @@ class _Show:
             "bulk_bytes": self._channels.subscribers["bulk"].arrived_bytes if self._channels.subscribers else 0,
             "dropped": self._dropped(),
         }
+
+
+def _open_show_log(file: Path | None) -> ShowLog | None:
+    try:
+        return ShowLog(file) if file else None
+    except OSError as error:
+        raise DaemonError(f"shown_log {file}: {error.strerror}") from error
 
 
 def _page_address(host: str, port: int) -> str:

@@ -9,29 +9,56 @@ tick showed.
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, BinaryIO
 
 import msgpack
 
+log = logging.getLogger(__name__)
+
 MAX_RECORD_BYTES = 8 * 1024 * 1024
 
 
 class ShowLog:
-    """Writes records; small ones stay in the file object's buffer, so a record costs microseconds."""
+    """Writes records; small ones stay in the file object's buffer, so a record costs microseconds. A full disk is said
+    once and ends the log, not the session.
+
+    Raises:
+        OSError: the file cannot be made.
+    """
 
     def __init__(self, path: Path) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
-        self._file: BinaryIO = path.open("wb")
+        self._path = path
+        self._file: BinaryIO | None = path.open("wb")
         self._packer = msgpack.Packer(use_bin_type=True)
 
     def add(self, kind: str, time_ns: int, payload: bytes | list[Any]) -> None:
         """Append one record."""
-        self._file.write(self._packer.pack([kind, time_ns, payload]))
+        if self._file is not None:
+            try:
+                self._file.write(self._packer.pack([kind, time_ns, payload]))
+            except OSError as error:
+                self._give_up(error)
 
     def close(self) -> None:
-        self._file.close()
+        """Write out what is buffered."""
+        file, self._file = self._file, None
+        if file is not None:
+            try:
+                file.close()
+            except OSError as error:
+                self._give_up(error)
+
+    def _give_up(self, error: OSError) -> None:
+        log.warning("%s: nothing more is logged: %s", self._path, error.strerror)
+        file, self._file = self._file, None
+        if file is not None:
+            with suppress(OSError):
+                file.close()  # what is buffered cannot be written either
 
 
 def read_show_log(path: Path) -> Iterator[tuple[str, int, Any]]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 from collections import deque
 
@@ -9,8 +10,11 @@ from common.body.body_regions import REGION_NAMES
 from common.runtime.clock import Clock
 from receiver.viewer.viewer import ConnectionState, ShownFrame, ViewerStatus
 
+log = logging.getLogger(__name__)
+
 LOST_AFTER_NS = 1_000_000_000  # without a skeleton
 RATE_SPAN_NS = 2_000_000_000
+RIVAL_SKELETONS = 15  # of another run within that span: more than what was on its way when a sender restarted
 
 
 class StreamState:
@@ -25,7 +29,9 @@ class StreamState:
         self._sender_present = False
         self._skeleton_ns: int | None = None
         self._skeletons = 0
-        self._history: deque[tuple[int, int, int, int]] = deque()  # time, skeletons, skeleton bytes, bulk bytes
+        # time, skeletons, skeleton bytes, bulk bytes, skeletons of other runs
+        self._history: deque[tuple[int, int, int, int, int]] = deque()
+        self._rival = False
 
     def presence(self, there: bool) -> None:
         """The sender appeared or disappeared."""
@@ -48,13 +54,17 @@ class StreamState:
     def receiving(self) -> bool:
         return self._skeleton_ns is not None and self._clock.now_ns() - self._skeleton_ns < LOST_AFTER_NS
 
-    def status(self, age_ms: float | None, skeleton_bytes: int, bulk_bytes: int) -> ViewerStatus:
-        """The figures now. ``skeleton_bytes``, ``bulk_bytes``: arrived in all so far; rates cover two seconds."""
+    def status(
+        self, age_ms: float | None, skeleton_bytes: int, bulk_bytes: int, foreign_skeletons: int = 0
+    ) -> ViewerStatus:
+        """The figures now. ``skeleton_bytes``, ``bulk_bytes`` and ``foreign_skeletons``, which are of a run of the
+        sender that is over for us: arrived in all so far. Rates cover two seconds."""
         now_ns = self._clock.now_ns()
-        self._history.append((now_ns, self._skeletons, skeleton_bytes, bulk_bytes))
+        self._history.append((now_ns, self._skeletons, skeleton_bytes, bulk_bytes, foreign_skeletons))
         while now_ns - self._history[0][0] > RATE_SPAN_NS:
             self._history.popleft()
-        then_ns, skeletons, then_skeleton_bytes, then_bulk_bytes = self._history[0]
+        then_ns, skeletons, then_skeleton_bytes, then_bulk_bytes, then_foreign = self._history[0]
+        self._note_rival(foreign_skeletons - then_foreign)
         span_s = max((now_ns - then_ns) / 1e9, 1e-3)
         connection, detail = self._connection()
         frame = self.frame
@@ -80,7 +90,14 @@ class StreamState:
         named = zip(REGION_NAMES, self.frame.region_sigma.tolist(), strict=True)
         return {name: sigma for name, sigma in named if math.isfinite(sigma)}
 
+    def _note_rival(self, foreign_skeletons: int) -> None:
+        rival, self._rival = self._rival, foreign_skeletons >= RIVAL_SKELETONS
+        if self._rival and not rival:
+            log.warning("two senders use this site's and person's name: the one that came last is shown")
+
     def _connection(self) -> tuple[ConnectionState, str]:
+        if self.receiving and self._rival:
+            return ConnectionState.RECEIVING, "two senders use this name, and the one that came last is shown"
         if self.receiving:
             waiting = self.frame is None or self.frame.pose_id is None
             return ConnectionState.RECEIVING, "skeleton only, the first mesh is on its way" if waiting else ""
@@ -88,4 +105,4 @@ class StreamState:
             return ConnectionState.WAITING, "the sender is there, but nobody is in view yet"
         if self._skeleton_ns is None:
             return ConnectionState.WAITING, ""
-        return ConnectionState.LOST, ""
+        return ConnectionState.LOST, "The sender has left, or cannot be reached. This page waits for it."

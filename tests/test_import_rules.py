@@ -39,3 +39,11 @@ def test_only_daemons_import_both_asyncio_and_numpy() -> None:
 
 def test_nothing_is_unpickled() -> None:
     assert modules_importing("pickle", "shelve", "marshal", any_of=True) == []
+
+
+def test_only_certificates_go_by_the_wall_clock() -> None:
+    """Everything else is monotonic, so that a step of the clock, of an hour or a year, changes nothing."""
+    words = ("time.time(", "time_ns()", "datetime.now", "utcnow", "perf_counter")
+    readers = {str(m) for m in MODULES for line in (ROOT / m).read_text().splitlines() if any(w in line for w in words)
+               and "monotonic_ns()" not in line and "thread_time_ns()" not in line}  # fmt: skip
+    assert readers == {"common/transport/zenoh_session.py"}

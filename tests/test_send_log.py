@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import pytest
+
 from sender.candidate_poses.mesh_scheduler import Reason, SendRecord
 from sender.send_log import REMEMBERED, SendLog
 
@@ -49,3 +51,14 @@ def test_without_a_file_the_newest_are_remembered() -> None:
     figures = log.figures()
     assert figures["by_reason"] == {"the receiver has nothing": 1, "largest gain of coverage": REMEMBERED + 4}
     assert [figures["newest"][index]["pose_id"] for index in (0, -1)] == [5, REMEMBERED + 4]
+
+
+def test_a_full_disk_is_said_once_and_ends_the_file_alone(caplog: pytest.LogCaptureFixture) -> None:
+    log = SendLog(Path("/dev/full"))
+    for pose_id in range(3):
+        log.add(record(pose_id))
+    assert len(log.figures()["newest"]) == 3
+    assert [entry.getMessage() for entry in caplog.records] == [
+        "/dev/full: nothing more is logged: No space left on device"
+    ]
+    log.close()

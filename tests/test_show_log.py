@@ -1,5 +1,7 @@
 """The log of what was shown survives being read back, and being cut short."""
 
+from pathlib import Path
+
 import pytest
 
 from receiver.show_log import ShowLog, read_show_log
@@ -29,3 +31,21 @@ def test_another_file_is_refused(tmp_path):
     path.write_bytes(b"\x01\x02\x03")
     with pytest.raises(ValueError, match="not a show log"):
         list(read_show_log(path))
+
+
+def test_a_full_disk_ends_the_log_and_not_the_session(caplog):
+    log = ShowLog(Path("/dev/full"))
+    for index in range(1000):
+        log.add("skeleton", index, b"x" * 250)
+    log.close()
+    assert [record.getMessage() for record in caplog.records] == [
+        "/dev/full: nothing more is logged: No space left on device"
+    ]
+
+
+def test_a_full_disk_noticed_at_the_end_is_said_too(caplog):
+    log = ShowLog(Path("/dev/full"))
+    log.add("skeleton", 1, b"x")
+    log.close()
+    log.close()
+    assert len(caplog.records) == 1

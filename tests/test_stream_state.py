@@ -86,3 +86,35 @@ def test_silence_after_skeletons_is_a_lost_connection_and_ends_with_the_next():
     assert state.status(None, 250, 0).connection is ConnectionState.LOST
     state.skeleton()
     assert state.status(None, 500, 0).connection is ConnectionState.RECEIVING
+
+
+def test_a_sender_that_left_is_told_apart_from_one_that_sees_nobody():
+    clock = ManualClock()
+    state = StreamState(clock)
+    state.presence(True)
+    state.skeleton()
+    clock.advance(2_000_000_000)
+    assert state.status(None, 0, 0).connection is ConnectionState.WAITING
+    state.presence(False)
+    status = state.status(None, 0, 0)
+    assert status.connection is ConnectionState.LOST
+    assert "has left" in status.detail
+
+
+def test_two_senders_of_one_name_are_flagged_but_not_the_last_packets_of_a_run_that_ended():
+    clock = ManualClock()
+    state = StreamState(clock)
+    details = []
+    for frame_number in range(200):
+        clock.advance(FRAME_NS)
+        state.skeleton()
+        foreign = 3 + max(0, frame_number - 100)
+        details.append(state.status(None, 0, 0, foreign).detail)
+    assert not any("two senders" in detail for detail in details[:110])
+    assert all("two senders" in detail for detail in details[-80:])
+    clock.advance(10_000_000_000)
+    state.skeleton()
+    state.status(None, 0, 0, foreign)
+    clock.advance(3_000_000_000)
+    state.skeleton()
+    assert "two senders" not in state.status(None, 0, 0, foreign).detail

@@ -360,6 +360,28 @@ async def test_bulk_and_reports_over_real_channels(endpoint: str) -> None:
     assert assembler.counts == {}
 
 
+async def test_a_second_session_with_the_id_of_another_is_kept_out(endpoint: str, tmp_path: Path) -> None:
+    """Ours are random; a file of Zenoh's own may fix one."""
+    file = tmp_path / "zenoh.json5"
+    file.write_text('{id: "abcdef0123456789"}')
+    async with AsyncExitStack() as stack:
+        ends = await pair(stack, endpoint)
+        publisher, inbox = ChannelPublisher(ends.listener, SKELETON, KEY), Inbox(ends.dialler)
+        twins = [
+            await stack.enter_async_context(open_session(LinkSettings(connect=(endpoint,), config_file=file)))
+            for _ in range(2)
+        ]
+        heard = [Inbox(twin) for twin in twins]
+        await until(lambda: publisher.heard and len(ends.listener.zenoh.info.transports()) == 2)
+        async with asyncio.timeout(WITHIN_S):
+            while not (inbox.payloads and heard[0].payloads):
+                publisher.put(b"pose")
+                await asyncio.sleep(0.02)
+        await asyncio.sleep(0.5)
+        assert heard[1].payloads == []
+        assert len(ends.listener.zenoh.info.transports()) == 2
+
+
 async def test_a_port_in_use_is_named(endpoint: str) -> None:
     async with open_session(LinkSettings(listen=(endpoint,))):
         with pytest.raises(TransportError, match=f"cannot listen: {endpoint} is in use"):

@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from common.runtime.daemon import DaemonError
 from common.runtime.stage_timer import StageTimer
 
 
@@ -39,7 +40,14 @@ class RunStatistics:
 
 
 def write_statistics(path: Path, figures: Mapping[str, Any]) -> None:
-    """Write the figures whole or not at all."""
+    """Write the figures whole or not at all.
+
+    Raises:
+        DaemonError: the file cannot be written.
+    """
     unfinished = path.with_name(path.name + ".part")
-    unfinished.write_text(json.dumps(figures, indent=2) + "\n", "utf-8")
-    os.replace(unfinished, path)
+    try:
+        unfinished.write_text(json.dumps(figures, indent=2) + "\n", "utf-8")
+        os.replace(unfinished, path)
+    except OSError as error:
+        raise DaemonError(f"stats_file {path}: {error.strerror}") from error
