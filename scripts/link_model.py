@@ -10,9 +10,9 @@ from __future__ import annotations
 import heapq
 import random
 from collections import Counter
-from collections.abc import Iterator
-from dataclasses import dataclass, field, fields, replace
-from typing import Generic, TypeVar
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass, field, fields, replace
+from typing import Any, Generic, TypeVar
 
 Packet = TypeVar("Packet")
 S = 1_000_000_000
@@ -74,7 +74,24 @@ class LinkConditions:
         return self.queue_bytes if self.queue_bytes is not None else self.rate_bps / 8 * self.queue_ms / 1e3
 
 
-CONDITION_NAMES = frozenset(field.name for field in fields(LinkConditions))
+def conditions_from(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Arguments of ``LinkConditions`` from JSON: ``burst`` is a list [p, r, loss_bad, loss_good].
+
+    Raises:
+        ValueError: an unknown name.
+    """
+    names = {field.name for field in fields(LinkConditions)}
+    unknown = ", ".join(sorted(set(values) - names))
+    if unknown:
+        raise ValueError(f"a path has no {unknown}; it has {', '.join(sorted(names))}")
+    burst = values.get("burst")
+    return {**values, "burst": BurstLoss(*burst)} if burst is not None else dict(values)
+
+
+def as_values(conditions: LinkConditions) -> dict[str, Any]:
+    """``conditions_from`` the other way, without what is as by default."""
+    plain = {name: value for name, value in asdict(conditions).items() if value != getattr(LinkConditions(), name)}
+    return {name: list(value.values()) if name == "burst" else value for name, value in plain.items()}
 
 
 @dataclass(order=True, slots=True)

@@ -274,6 +274,9 @@ class BulkWindow:
             gain = GAIN * max(1.0, round_trip_s / 0.1)
             step = gain * (target - q) / target * acked * self.chunk_bytes / self._window
             self._window += max(-acked / 4, step)
+        if q < target / 2 and self._rates:
+            # Where the path delivered more a moment ago, the queue was a hiccup: TCP's own, say (BBR's every 10 s).
+            self._window = max(self._window, 0.8 * max(list(self._rates)[-8:]) * round_trip_s)
         if q > 3 * target and self._rates and not heeded and not self._slow_start:
             self._reduced_ns = now_ns
             self._window = min(self._window, 0.85 * self._rates[-1] * round_trip_s)
