@@ -25,6 +25,7 @@ from common.transport.zenoh_session import ZenohSession
 from common.wire.header import WireError
 from common.wire.receiver_report import encode_report
 from common.wire.repository_list import RepositoryList, decode_repository_list, encode_repository_list
+from common.wire.residual_packet import is_residual
 from common.wire.skeleton_packet import SkeletonPacket
 from receiver.incoming_stream import IncomingStream
 
@@ -32,13 +33,14 @@ from receiver.incoming_stream import IncomingStream
 @dataclass(frozen=True, slots=True)
 class Handlers:
     """Called on the loop. ``skeleton(packet, its body, its bytes)``; ``pose(message)``; ``body(message)``; ``epoch()``:
-    a new run of the sender has begun; ``presence(there)``."""
+    a new run of the sender has begun; ``presence(there)``; ``residual(message)``."""
 
     skeleton: Callable[[SkeletonPacket, Skeleton, bytes], None]
     pose: Callable[[bytes], None]
     body: Callable[[bytes], None]
     epoch: Callable[[], None]
     presence: Callable[[bool], None]
+    residual: Callable[[bytes], None] = lambda _: None
 
 
 class ReceiverChannels:
@@ -148,7 +150,7 @@ class ReceiverChannels:
         message = self.stream.chunk(chunk)
         self._reception.chunk(chunk, len(arrival.payload), arrival.arrival_ns)
         if message is not None:
-            self._handlers.pose(message)
+            (self._handlers.residual if is_residual(message) else self._handlers.pose)(message)
 
     def _key(self, channel: Channel, receiver: str | None = None) -> str:
         return channel_key(channel, self._site, self._person, receiver)

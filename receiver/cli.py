@@ -32,6 +32,7 @@ DECODE_EXAMPLES = """examples:
   telepose-receive decode monday.mcap side.mp4 --angle 90 --size 1280x720
   telepose-receive decode monday.mcap pictures/                       000000.png, 000001.png, ... one for each frame
   telepose-receive decode monday.mcap meshes/ --as ply                the moving person as coloured meshes
+  telepose-receive decode monday.mcap points.mp4 --points             the paper's way: points that residual maps update
   telepose-receive decode monday.mcap --page                          in the browser, over and over, at its own pace
 
 Sessions are MCAP files, and need the recording extra: pip install '.[recording]'. The same file gives the same
@@ -54,6 +55,9 @@ def parse_arguments(arguments: list[str] | None = None) -> argparse.Namespace:
     )
     view.add_argument(
         "--window", dest="view.window", action="store_true", default=None, help="a desktop window too (Open3D)"
+    )
+    view.add_argument(
+        "--points", dest="view.mode", action="store_const", const="points", help="show points; P on the page switches"
     )
     view.add_argument(
         "--log-shown", dest="shown_log", type=Path, metavar="FILE", help="keep what was shown, for measuring"
@@ -101,6 +105,9 @@ def parse_decode_arguments(arguments: list[str]) -> argparse.Namespace:
     parser.add_argument("--size", type=_size, default=(640, 480), metavar="WxH", help="pixels (default 640x480)")
     parser.add_argument(
         "--angle", dest="angle_deg", type=_angle, default=0.0, metavar="DEG", help="seen from there, 0: the front"
+    )
+    parser.add_argument(
+        "--points", dest="view.mode", action="store_const", const="points", help="residual maps' points, not meshes"
     )
     parser.add_argument("--page", action="store_true", help="play it in the browser page instead")
     parser.add_argument("--once", action="store_true", help="with --page: end when it has been played")
@@ -184,8 +191,7 @@ def run_decode(arguments: list[str]) -> int:
     options = parse_decode_arguments(arguments)
     set_up_logging("INFO" if options.page else "WARNING")
     prepare_threads()
-    port = getattr(options, "http.port")
-    given: dict[str, object] = {} if port is None else {"http.port": port}
+    given = {key: value for key, value in vars(options).items() if "." in key and value is not None}
     from receiver.decode import DecodeError, DecodeOptions, decode  # numba and OpenCV take a second: not for --help
 
     try:

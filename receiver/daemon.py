@@ -31,12 +31,13 @@ from common.transport.access_rules import for_receiver, receiver_name
 from common.transport.link_settings import with_endpoints
 from common.transport.zenoh_session import ZenohSession, open_session, own_certificate
 from common.wire.header import WireError
+from common.wire.receiver_report import WANTS_RESIDUALS
 from common.wire.repository_list import REPOSITORY_LIST_MAX_POSES
 from common.wire.skeleton_packet import SkeletonPacket
 from receiver.channels_in import Handlers, ReceiverChannels
 from receiver.config import ReceiverSettings
 from receiver.jitter_buffer import JitterBuffer
-from receiver.pipeline import AnimationPath, ReceivedPose, Shown, SkeletonToShow, mesh_of
+from receiver.pipeline import AnimationPath, PointPath, ReceivedPose, Shown, SkeletonToShow, mesh_of
 from receiver.rehearsal import rehearse
 from receiver.show_log import ShowLog
 from receiver.stream_state import StreamState
@@ -52,6 +53,7 @@ CLOCK_PERIOD_S = 1.0
 CLOCK_QUICK_PERIOD_S = 0.1  # until the offset is known
 BODY_PERIOD_S = 0.1
 MESHES_WAITING = 8
+RESIDUALS_WAITING = 8
 
 
 class ReceiverDaemon:
@@ -114,18 +116,23 @@ class _Show:
         self._animation = ComputeWorker("animation", self._animation_path.show, self._on_shown, rehearse)
         self._mesher = ThreadPoolExecutor(1, "mesher", into_background)
         self._messages: asyncio.Queue[bytes] = asyncio.Queue(MESHES_WAITING)
+        self._point_path = PointPath(settings.person, self._timer)
+        self._point_maker = ThreadPoolExecutor(1, "points")  # of its own: a mesh takes as long as ten frames
+        self._residuals: asyncio.Queue[bytes] = asyncio.Queue(RESIDUALS_WAITING)
         self._held: tuple[int, dict[int, int]] = (-1, {})  # sender's run; bytes of the poses taken in, by id
         self._offered_poses = 0
+        self._points_made = 0
         self._appeared = asyncio.Event()
         self._meshes: deque[ReceivedPose] = deque()  # meshed, waiting for the next skeleton; bounded in _mesh_poses
         self._newest: SkeletonToShow | None = None
         smoothness = settings.view.smoothness
         self._jitter = JitterBuffer(smoothness) if smoothness > 0 else None  # without it the newest wins
         self._log = _open_show_log(settings.shown_log)
+        view = settings.view
         self.viewer: WebViewer | HeadlessScreen = (
-            HeadlessScreen(self._timer, skinning=settings.view.skinning)
-            if settings.view.headless
-            else WebViewer(allowed_hosts=settings.view.allowed_hosts, skinning=settings.view.skinning)
+            HeadlessScreen(self._timer, skinning=view.skinning, mode=view.mode)
+            if view.headless
+            else WebViewer(allowed_hosts=view.allowed_hosts, skinning=view.skinning, mode=view.mode)
         )
         self.metrics = self._make_metrics()
         session.add_metrics(self.metrics)
@@ -133,11 +140,14 @@ class _Show:
     async def run(self, daemon: Daemon, page: str) -> None:
         """Receive and show until cancelled, or until the window on ``page`` is closed where there is one."""
         self._channels.open(
-            Handlers(self._on_skeleton, self._on_pose, self._on_body, self._on_epoch, self._on_presence)
+            Handlers(
+                self._on_skeleton, self._on_pose, self._on_body, self._on_epoch, self._on_presence, self._on_residual
+            )
         )
         lasting: list[Coroutine[Any, Any, None]] = [
             self._animation.run(),
             self._mesh_poses(),
+            self._make_points(),
             steadily(REPORT_PERIOD_S, self._report),
             steadily(STATUS_PERIOD_S, self._tell_status),
             steadily(1 / self._settings.view.display_hz, self._tick, self._on_missed_ticks),
@@ -159,7 +169,8 @@ class _Show:
     def close(self) -> None:
         """Hear nothing more, and write out what is buffered."""
         self._channels.close()
-        self._mesher.shutdown(wait=False, cancel_futures=True)
+        for thread in (self._mesher, self._point_maker):
+            thread.shutdown(wait=False, cancel_futures=True)
         if self._log is not None:
             self._log.close()
 
@@ -180,6 +191,7 @@ class _Show:
 
     def _on_epoch(self) -> None:
         log.info("the sender has started anew")
+        self.viewer.show_points(None)
         self._appeared.set()
 
     def _on_presence(self, there: bool) -> None:
@@ -194,6 +206,29 @@ class _Show:
             self._messages.get_nowait()
             self._counts["pose waiting too long"] += 1
         self._messages.put_nowait(message)
+
+    def _on_residual(self, message: bytes) -> None:
+        """A residual packet is complete; when too many wait for decoding the oldest goes."""
+        if self._residuals.full():
+            self._residuals.get_nowait()
+            self._counts["residual waiting too long"] += 1
+        self._residuals.put_nowait(message)
+
+    async def _make_points(self) -> None:
+        """Residual packets into points, one after the other, as each may need the one before."""
+        loop = asyncio.get_running_loop()
+        while True:
+            message = await self._residuals.get()
+            bodies = self._channels.stream.bodies
+            try:
+                points = await loop.run_in_executor(self._point_maker, self._point_path.take, message, bodies)
+            except WireError as error:
+                self._counts["residual refused"] += 1
+                log.warning("a residual packet is refused: %s", error)
+                continue
+            if points is not None:
+                self._points_made += 1
+                self.viewer.show_points(points)
 
     async def _mesh_poses(self) -> None:
         """Mesh candidate poses, one after the other."""
@@ -275,7 +310,8 @@ class _Show:
         self._counts["tick missed"] += count
 
     def _report(self) -> None:
-        self._channels.send_report(self._state.repository_poses)
+        wants = WANTS_RESIDUALS if self.viewer.wants_points else 0
+        self._channels.send_report(self._state.repository_poses, wants)
 
     def _tell_status(self) -> None:
         frame = self._state.frame
@@ -313,6 +349,7 @@ class _Show:
         metrics.counter("skeletons_received_total", "Skeletons that were the newest", lambda: skeletons["accepted"])
         metrics.counter("skeletons_lost_total", "Gaps in the sequence", lambda: skeletons["lost"])
         metrics.counter("frames_shown_total", "Frames given to the viewer", lambda: self._state.frames_shown)
+        metrics.counter("points_shown_total", "Residual packets given to the viewer", lambda: self._points_made)
         metrics.counter("dropped_total", "What was dropped, by cause", self._dropped)
         metrics.gauge("repository_poses", "Candidate poses held", lambda: self._state.repository_poses)
         metrics.gauge("offered_poses", "Poses the sender held when it was last asked", lambda: self._offered_poses)
@@ -340,6 +377,7 @@ class _Show:
             **judged,
             **refused,
             **chunks,
+            **{f"residual {cause}": count for cause, count in self._point_path.counts.items()},
             **channels.counts,
             **channels.stream.counts,
             **self._counts,

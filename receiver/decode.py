@@ -12,7 +12,7 @@ from common.runtime.progress import ProgressLine
 from common.runtime.session_recording import RecordingError, SessionReader
 from common.transport.channels import SCHEMA
 from receiver.config import ReceiverSettings
-from receiver.decoded_files import Output, PersonFolder, PictureFolder, VideoFile
+from receiver.decoded_files import Output, PersonFolder, PictureFolder, PointFolder, VideoFile
 from receiver.session_player import SessionPlayer, display_ticks
 from receiver.viewer.person_files import ExportError
 
@@ -49,7 +49,7 @@ def decode(settings: ReceiverSettings, options: DecodeOptions, say: Callable[[st
     try:
         reader = SessionReader(options.session, SCHEMA)
         rate_hz = options.rate_hz or frame_rate_hz(reader)
-        player = SessionPlayer(settings.repository, person_of(reader))
+        player = SessionPlayer(settings.repository, person_of(reader), points=settings.view.mode == "points")
         output = _output(settings, options, rate_hz)
         try:
             interrupted = not _play(reader, player, output, rate_hz)
@@ -83,12 +83,16 @@ def _play(reader: SessionReader, player: SessionPlayer, output: Output, rate_hz:
 
 def _output(settings: ReceiverSettings, options: DecodeOptions, rate_hz: float) -> Output:
     skinning = settings.view.skinning
-    seen = options.width, options.height, options.angle_deg, skinning
+    seen = options.width, options.height, options.angle_deg, skinning, settings.view.mode
     if options.out.suffix.lower() == ".mp4":
         return VideoFile(options.out, rate_hz, *seen)
     if options.kind == "png":
         return PictureFolder(options.out, *seen)
-    return PersonFolder(options.out, f".{options.kind}", skinning)
+    if settings.view.mode == "mesh":
+        return PersonFolder(options.out, f".{options.kind}", skinning)
+    if options.kind != "ply":
+        raise ExportError(f"points are written as ply, not as {options.kind}")
+    return PointFolder(options.out)
 
 
 def person_of(reader: SessionReader) -> int:

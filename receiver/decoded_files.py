@@ -17,10 +17,11 @@ from common.geometry.rigid_transform import look_at
 from receiver.viewer.offscreen_viewer import OffscreenViewer
 from receiver.viewer.page_messages import encode_frame, encode_hello, encode_pose, encode_remove
 from receiver.viewer.page_view import PageView
-from receiver.viewer.person_files import ExportError, write_person
-from receiver.viewer.viewer import ShownFrame, Viewer, ViewerStatus
+from receiver.viewer.person_files import ExportError, write_person, write_points
+from receiver.viewer.viewer import NullViewer, ShownFrame, Viewer, ViewerStatus, ViewMode
 
 if TYPE_CHECKING:
+    from common.body.link_points import LinkPoints
     from common.body.rigged_mesh import RiggedMesh
 
 log = logging.getLogger(__name__)
@@ -53,8 +54,8 @@ def camera_before(pelvis: NDArray[np.floating], width: int, height: int, angle_d
 class _Pictures:
     """The person rendered offscreen, white where nobody is; the camera stands before where they are first seen."""
 
-    def __init__(self, width: int, height: int, angle_deg: float, skinning: Skinning) -> None:
-        self.viewer = OffscreenViewer(skinning)
+    def __init__(self, width: int, height: int, angle_deg: float, skinning: Skinning, mode: ViewMode) -> None:
+        self.viewer = OffscreenViewer(skinning, mode)
         self.pictures = self.empty = 0
         self._size = width, height
         self._angle_deg = angle_deg
@@ -73,7 +74,7 @@ class _Pictures:
         return np.ascontiguousarray(colour[..., ::-1])
 
     def _words(self) -> str:
-        nobody = f", {self.empty} of them without a mesh to show" if self.empty else ""
+        nobody = f", {self.empty} of them with nothing to show yet" if self.empty else ""
         return f"{self.pictures} pictures{nobody}"
 
 
@@ -85,9 +86,16 @@ class VideoFile(_Pictures):
     """
 
     def __init__(
-        self, file: Path, rate_hz: float, width: int, height: int, angle_deg: float, skinning: Skinning
+        self,
+        file: Path,
+        rate_hz: float,
+        width: int,
+        height: int,
+        angle_deg: float,
+        skinning: Skinning,
+        mode: ViewMode = "mesh",
     ) -> None:
-        super().__init__(width, height, angle_deg, skinning)
+        super().__init__(width, height, angle_deg, skinning, mode)
         self._file = file
         self._unfinished = file.with_name(f"{file.stem}.part{file.suffix}")
         _check_writable(self._unfinished)
@@ -119,8 +127,10 @@ class PictureFolder(_Pictures):
         ExportError: the folder is not empty or cannot be made.
     """
 
-    def __init__(self, folder: Path, width: int, height: int, angle_deg: float, skinning: Skinning) -> None:
-        super().__init__(width, height, angle_deg, skinning)
+    def __init__(
+        self, folder: Path, width: int, height: int, angle_deg: float, skinning: Skinning, mode: ViewMode = "mesh"
+    ) -> None:
+        super().__init__(width, height, angle_deg, skinning, mode)
         self._folder = _empty_folder(folder)
 
     def write(self, tick: int) -> None:
@@ -175,6 +185,52 @@ class PersonFolder:
         """Every file is whole."""
 
 
+class PointFolder:
+    """``000000.ply`` …: the person as coloured points; ticks without any are left out.
+
+    Raises:
+        ExportError: the folder is not empty or cannot be made.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.viewer = _NewestPoints()
+        self._folder = _empty_folder(folder)
+        self._clouds = self._ticks = 0
+
+    def write(self, tick: int) -> None:
+        """The points at a tick.
+
+        Raises:
+            ExportError: they cannot be written.
+        """
+        self._ticks += 1
+        points, frame = self.viewer.points, self.viewer.frame
+        if points is not None and frame is not None and frame.links is not None:
+            write_points(self._folder / f"{tick:06d}.ply", points.posed(frame.links), points.colours)
+            self._clouds += 1
+
+    def finish(self) -> str:
+        """What there is."""
+        return f"{self._folder}: {self._clouds} clouds of points, of {self._ticks} instants"
+
+    def discard(self) -> None:
+        """Every file is whole."""
+
+
+class _NewestPoints(NullViewer):
+    """A viewer that knows the newest points and the frame that moves them."""
+
+    def __init__(self) -> None:
+        self.points: LinkPoints | None = None
+        self.frame: ShownFrame | None = None
+
+    def show_points(self, points: LinkPoints | None) -> None:
+        self.points = points
+
+    def show(self, frame: ShownFrame) -> None:
+        self.frame = frame
+
+
 class _PageReader:
     """A viewer that shows what a browser's page is told, to a ``PageView``."""
 
@@ -190,6 +246,9 @@ class _PageReader:
 
     def remove_pose(self, pose_id: int) -> None:
         self.view.take(encode_remove(pose_id))
+
+    def show_points(self, points: LinkPoints | None) -> None:
+        """Meshes are what is shown here."""
 
     def show(self, frame: ShownFrame) -> None:
         self.view.take(encode_frame(frame))

@@ -6,6 +6,7 @@ The live receiver feeds it what Zenoh delivers, the player of a session what its
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from common.body.skeleton import Skeleton
@@ -49,6 +50,10 @@ class IncomingStream:
     def body_revision(self) -> int | None:
         """Of the body that came last."""
         return self._bodies.newest_revision
+
+    def bodies(self, epoch: int) -> Mapping[int, Skeleton]:
+        """The sizes known by revision, of that run of the sender."""
+        return self._bodies.by_revision if epoch == self._bodies.epoch else {}
 
     @property
     def lacks_body(self) -> bool:

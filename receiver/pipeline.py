@@ -1,11 +1,13 @@
 """The receiver on one page: from a skeleton packet to what the viewer shows, and from a candidate pose to its mesh.
 
-DISPOSE Fig. 1, right half: the skeleton never waits for a mesh; it moves the best of those already here.
+DISPOSE Fig. 1, right half: the skeleton never waits for a mesh; it moves the best of those already here. In point mode
+(Lien §5) it moves the points of the newest residual packet, which ``PointPath`` makes.
 """
 
 from __future__ import annotations
 
 from collections import Counter, deque
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from statistics import median
 
@@ -15,6 +17,7 @@ from numpy.typing import NDArray
 from common.body.body_regions import region_weights
 from common.body.distortion_score import region_scores
 from common.body.joint_edges import ScoreForm
+from common.body.link_points import LinkPoints
 from common.body.rigged_mesh import RiggedMesh, build_rigged_mesh
 from common.body.skeleton import Skeleton
 from common.body.skeleton_pose import forward_kinematics
@@ -23,12 +26,15 @@ from common.runtime.clock import Clock
 from common.runtime.stage_timer import StageTimer
 from common.wire.candidate_pose import decode_candidate_pose
 from common.wire.header import WireError
+from common.wire.residual_packet import decode_residual_header
 from common.wire.skeleton_packet import SkeletonPacket
 from receiver.config import RepositorySettings as Settings
 from receiver.repository.pose_repository import PoseRepository, RepositorySettings
 from receiver.repository.pose_selection import PoseSelector, Selection, SelectionSettings
+from receiver.residual_decoder import ResidualDecoder, link_points
 from receiver.viewer.viewer import ShownFrame
 
+RESIDUAL_POINTS_MAX = 200_000  # bounds what a packet can make us allocate
 SEARCHES_REMEMBERED = 31  # the median of so many is what a search costs: one that was interrupted says nothing
 
 
@@ -141,7 +147,7 @@ class AnimationPath:
             self._shown = _shown_frame(packet, None, T_world_link, float("nan"))
             return self._shown
         if selection.withheld and self._shown is not None and self._shown.pose_id in self._repository.pose_ids:
-            return replace(self._shown, withheld=True)
+            return replace(self._shown, withheld=True, links=T_world_link[:, :3])  # points are never withheld
         self._repository.count_use(selection.pose_id)
         mesh = self._repository.get(selection.pose_id)
         self._shown = _shown_frame(packet, mesh, T_world_link, selection.sigma)
@@ -175,6 +181,33 @@ class AnimationPath:
             self._repository.reset(epoch)
 
 
+class PointPath:
+    """Every residual packet → maps → the person's points on their links. One thread's own. ``counts``: packets of no
+    use, by cause."""
+
+    def __init__(self, person: int, timer: StageTimer) -> None:
+        self._person = person
+        self._timer = timer
+        self._decoder = ResidualDecoder(RESIDUAL_POINTS_MAX)
+
+    @property
+    def counts(self) -> Counter[str]:
+        return Counter({"late": self._decoder.late, "without reference": self._decoder.without_reference})
+
+    def take(self, message: bytes, bodies: Callable[[int], Mapping[int, Skeleton]]) -> LinkPoints | None:
+        """The points now, None where the packet shows nothing newer; ``bodies(epoch)``: sizes by revision.
+
+        Raises:
+            WireError: it cannot be decoded, or is another person's.
+        """
+        header = decode_residual_header(message)
+        if header.person != self._person:
+            raise WireError(f"residual packet of person {header.person}, expected {self._person}")
+        with self._timer.stage("residual maps"):
+            maps = self._decoder.decode(message, bodies(header.epoch))
+            return None if maps is None else link_points(maps)
+
+
 def _shown_frame(
     packet: SkeletonPacket, mesh: RiggedMesh | None, T_world_link: NDArray[np.float32], sigma: float
 ) -> ShownFrame:
@@ -184,6 +217,7 @@ def _shown_frame(
         pose_id=None if mesh is None else mesh.pose_id,
         motion=None if mesh is None else link_motion(mesh, T_world_link),
         joints=np.ascontiguousarray(T_world_link[:, :3, 3]),
+        links=T_world_link[:, :3],
         sigma=sigma,
         region_sigma=None if mesh is None else region_scores(mesh, T_world_link),
         fit_confidence=packet.fit_confidence,

@@ -12,7 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from common.body.cylindrical_map import LinkMaps, resampled, unproject
+from common.body.cylindrical_map import LinkMaps, resampled, unproject, unproject_to_links
+from common.body.link_points import LinkPoints
 from common.body.map_layout import LEVEL_MAX, POINTS_MAX, MapLayout, map_layout
 from common.body.skeleton import Skeleton
 from common.geometry.point_cloud import PointCloud
@@ -83,6 +84,14 @@ class ResidualDecoder:
 def cloud(shown: ResidualMaps, T_world_link: NDArray[np.float32]) -> PointCloud:
     """The person's points, as dense at every level, moved to the links ``T_world_link`` (L, 4, 4) of any pose of the
     same body. Normals are the directions away from the bones."""
+    return PointCloud(*unproject(*_at_full_level(shown), T_world_link))
+
+
+def link_points(shown: ResidualMaps) -> LinkPoints:
+    """The same points on their links: worked out once, moved by every skeleton."""
+    return unproject_to_links(*_at_full_level(shown))
+
+
+def _at_full_level(shown: ResidualMaps) -> tuple[MapLayout, LinkMaps]:
     full = map_layout(shown.skeleton, shown.header.points, LEVEL_MAX)
-    maps = shown.maps if shown.layout is full else resampled(shown.layout, shown.maps, full)
-    return PointCloud(*unproject(full, maps, T_world_link))
+    return full, shown.maps if shown.layout is full else resampled(shown.layout, shown.maps, full)

@@ -12,6 +12,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from common.body.link_points import LinkPoints
 from common.runtime.clock import MonotonicClock
 from common.runtime.daemon import Daemon, DaemonError
 from common.runtime.http_access import read_token, tls_context
@@ -38,7 +39,7 @@ class _Due:
     """What to show at ``time_ns`` of the session, and the bytes of it up to there."""
 
     time_ns: int
-    shown: Shown
+    shown: Shown | LinkPoints
     skeleton_bytes: int
     bulk_bytes: int
 
@@ -51,7 +52,8 @@ class SessionPage:
         self._session = session
         self._once = once
         self._clock = MonotonicClock()
-        self._viewer = WebViewer(allowed_hosts=settings.view.allowed_hosts, skinning=settings.view.skinning)
+        view = settings.view
+        self._viewer = WebViewer(allowed_hosts=view.allowed_hosts, skinning=view.skinning, mode=view.mode)
         self._thread = ThreadPoolExecutor(1, "player")
         self._poses: set[int] = set()
 
@@ -84,8 +86,9 @@ class SessionPage:
         for pose_id in self._poses:
             self._viewer.remove_pose(pose_id)
         self._poses.clear()
+        self._viewer.show_points(None)
         reader = SessionReader(self._session, SCHEMA)
-        player = SessionPlayer(self._settings.repository, person_of(reader))
+        player = SessionPlayer(self._settings.repository, person_of(reader), points=True)
         ahead: asyncio.Queue[_Due | None] = asyncio.Queue(AHEAD)
         async with asyncio.TaskGroup() as group:
             group.create_task(self._play_ahead(_due(reader, player), ahead))
@@ -113,6 +116,9 @@ class SessionPage:
             if begin_ns is None or not -LATE_NS < wait_ns < SILENCE_NS:
                 begin_ns, wait_ns = now_ns - due.time_ns, 0
             await asyncio.sleep(max(wait_ns, 0) / 1e9)
+            if isinstance(due.shown, LinkPoints):
+                self._viewer.show_points(due.shown)
+                continue
             now_ns = self._clock.now_ns()
             age_ms = (now_ns - begin_ns - due.time_ns) / 1e6
             frame = replace(due.shown.frame, age_ms=age_ms)

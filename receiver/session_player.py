@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections import Counter, deque
 from collections.abc import Iterable, Iterator
 
+from common.body.link_points import LinkPoints
 from common.runtime.clock import ManualClock
 from common.runtime.session_recording import StoredMessage
 from common.runtime.stage_timer import StageTimer
@@ -17,7 +18,7 @@ from common.wire.header import WireError
 from common.wire.residual_packet import is_residual
 from receiver.config import RepositorySettings
 from receiver.incoming_stream import IncomingStream
-from receiver.pipeline import AnimationPath, ReceivedPose, Shown, SkeletonToShow, mesh_of
+from receiver.pipeline import AnimationPath, PointPath, ReceivedPose, Shown, SkeletonToShow, mesh_of
 from receiver.viewer.viewer import Viewer
 
 MESHES_WAITING = 8  # for the next skeleton, as in the daemon
@@ -25,10 +26,10 @@ SILENCE_NS = 10_000_000_000  # a gap between two messages that is longer is not 
 
 
 class SessionPlayer:
-    """Plays the stream of ``person``. ``counts``: messages by what became of them; ``last_error``: of a refused one;
-    ``payload_bytes``: by channel."""
+    """Plays the stream of ``person``, residual maps too if ``points`` are wanted. ``counts``: messages by what became
+    of them; ``last_error``: of a refused one; ``payload_bytes``: by channel."""
 
-    def __init__(self, settings: RepositorySettings, person: int) -> None:
+    def __init__(self, settings: RepositorySettings, person: int, points: bool = False) -> None:
         self.counts: Counter[str] = Counter()
         self.payload_bytes: Counter[str] = Counter()
         self.last_error = ""
@@ -36,11 +37,15 @@ class SessionPlayer:
         self._person = person
         self._stream = IncomingStream(person)
         clock = ManualClock()
-        self._animation = AnimationPath(settings, StageTimer(clock), clock)
+        timer = StageTimer(clock)
+        self._animation = AnimationPath(settings, timer, clock)
+        self._points = PointPath(person, timer)
+        self._wants_points = points
         self._arrived: deque[ReceivedPose] = deque(maxlen=MESHES_WAITING)
 
-    def take(self, message: StoredMessage) -> Shown | None:
-        """Take in the next message; what a skeleton leads to. What is malformed is counted and changes nothing."""
+    def take(self, message: StoredMessage) -> Shown | LinkPoints | None:
+        """Take in the next message; what a skeleton or a residual packet leads to. What is malformed is counted and
+        changes nothing."""
         channel = _channel_of(message.key, self._person)
         self.payload_bytes[channel] += len(message.payload)
         try:
@@ -49,7 +54,7 @@ class SessionPlayer:
             if channel == channels.BODY.name:
                 self._stream.body(message.payload)
             elif channel == channels.BULK.name:
-                self._take_chunk(message.payload)
+                return self._take_chunk(message.payload)
             else:
                 self.counts["of no interest"] += 1
         except WireError as error:
@@ -65,14 +70,16 @@ class SessionPlayer:
         self.counts["shown"] += 1
         return self._animation.show(SkeletonToShow(newest.packet, newest.body, self._arrived))
 
-    def _take_chunk(self, payload: bytes) -> None:
+    def _take_chunk(self, payload: bytes) -> LinkPoints | None:
         whole = self._stream.chunk(decode_chunk(payload))
         if whole is not None and is_residual(whole):
             self.counts["residuals"] += 1
-        elif whole is not None:
+            return self._points.take(whole, self._stream.bodies) if self._wants_points else None
+        if whole is not None:
             self.counts["pose waiting too long"] += len(self._arrived) == MESHES_WAITING
             self._arrived.append(mesh_of(whole, self._person, self._settings.score_form))
             self.counts["poses"] += 1
+        return None
 
 
 def _channel_of(key: str, person: int) -> str:
@@ -81,8 +88,11 @@ def _channel_of(key: str, person: int) -> str:
     return parts[3] if len(parts) >= 4 and parts[2] == str(person) else ""
 
 
-def put_on(viewer: Viewer, shown: Shown) -> None:
-    """Tell a viewer what a skeleton led to."""
+def put_on(viewer: Viewer, shown: Shown | LinkPoints) -> None:
+    """Tell a viewer what a message led to."""
+    if isinstance(shown, LinkPoints):
+        viewer.show_points(shown)
+        return
     for pose_id in shown.removed:
         viewer.remove_pose(pose_id)
     for mesh in shown.added:

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from common.body.body_regions import vertex_regions
 from common.body.joint_edges import joint_edges
+from common.body.link_points import LinkPoints
 from common.body.rigged_mesh import RiggedMesh
 from common.body.skeleton import LINK_COUNT, LINK_INDEX, Skeleton, human_skeleton
 from common.body.skeleton_pose import SkeletonPose, bone_segments, forward_kinematics, joint_positions, rest_pose
@@ -68,10 +69,24 @@ def capsule_person(pose_id: int = 0, pose: SkeletonPose | None = None) -> Rigged
 def shown_frame(mesh: RiggedMesh | None, time_s: float, sequence: int = 0) -> ShownFrame:
     """What the receiver would show at ``time_s``; with no mesh, the joints alone."""
     pose = pose_at(time_s)
-    motion = None if mesh is None else link_motion(mesh, forward_kinematics(SKELETON, pose))
+    links = forward_kinematics(SKELETON, pose)
+    motion = None if mesh is None else link_motion(mesh, links)
     pose_id = None if mesh is None else mesh.pose_id
     joints = joint_positions(SKELETON, pose)
-    return ShownFrame(int(time_s * 1e9), sequence, pose_id, motion, joints, 0.031, 0.9, pose.confidence, 42.0)
+    return ShownFrame(
+        int(time_s * 1e9), sequence, pose_id, motion, joints, 0.031, 0.9, pose.confidence, 42.0, links=links[:, :3]
+    )
+
+
+def link_points(person: RiggedMesh, every: int = 1) -> LinkPoints:
+    """Its vertices as points on their links, coloured as the texture is there."""
+    link = person.vertex_link[::every]
+    T_link_world = person.T_link_world[link]
+    vertices = person.mesh.vertices[::every]
+    positions = np.einsum("nij,nj->ni", T_link_world[:, :3, :3], vertices) + T_link_world[:, :3, 3]
+    height, width = person.mesh.texture.shape[:2]
+    column, row = (person.mesh.uv[::every] * [width, height]).astype(int).clip(0, [width - 1, height - 1]).T
+    return LinkPoints(positions.astype(np.float32), link, person.mesh.texture[row, column])
 
 
 def _colour(link: int) -> tuple[int, int, int]:

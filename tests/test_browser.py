@@ -23,9 +23,9 @@ from common.geometry.camera_model import Camera
 from common.geometry.rasterizer import render
 from common.geometry.rigid_transform import look_at
 from receiver.viewer.offscreen_viewer import OffscreenViewer
-from receiver.viewer.viewer import ConnectionState, ViewerStatus
+from receiver.viewer.viewer import ConnectionState, ViewerStatus, ViewMode
 from receiver.viewer.web_viewer import PAGE_FOLDER, WebViewer
-from tests.capsule_person import SHIRT, SKIN, TROUSERS, capsule_person, shown_frame
+from tests.capsule_person import SHIRT, SKIN, TROUSERS, capsule_person, link_points, shown_frame
 from tests.chromium import Page, find_chromium, open_page
 
 pytestmark = [
@@ -52,9 +52,11 @@ def figure(name: str) -> str:
 
 
 @asynccontextmanager
-async def receiver(port: int | None = None, skinning: Skinning = "spherical") -> AsyncIterator[tuple[WebViewer, str]]:
+async def receiver(
+    port: int | None = None, skinning: Skinning = "spherical", mode: ViewMode = "mesh"
+) -> AsyncIterator[tuple[WebViewer, str]]:
     """A viewer and the address of its page."""
-    viewer = WebViewer(skinning=skinning)
+    viewer = WebViewer(skinning=skinning, mode=mode)
     app = web.Application()
     viewer.add_routes(app)
     async with TestServer(app, port=port) as server:
@@ -141,6 +143,52 @@ async def test_page_and_offscreen_renderer_agree(skinning: Skinning, person: Rig
     error = (picture.astype(float) - expected) ** 2
     assert 10 * np.log10(255**2 / error.mean()) >= 35
     assert page.problems == []
+
+
+async def test_page_and_offscreen_renderer_agree_on_points() -> None:
+    """The same points, moved by the page's vertex shader and drawn as its sprites, and by the offscreen renderer."""
+    frame = shown_frame(None, 2.3)
+    points = link_points(captured_person(7))
+    async with receiver(mode="points") as (viewer, url), open_page(url, 800, 600) as page:
+        viewer.set_status(RECEIVING)
+        viewer.show_points(points)
+        viewer.show(frame)
+        await page.press("h")
+        picture = await photograph_when(page, lambda p: coloured(p, SHIRT).sum() > 500)
+        camera = await camera_of(page, 800, 600)
+        assert viewer.wants_points
+    offscreen = OffscreenViewer(mode="points")
+    offscreen.show_points(points)
+    offscreen.show(frame)
+    expected = offscreen.render([camera])[0][0]
+    room = (picture[..., 0] < 78) & (picture[..., 2] < 112)
+    picture[room] = 255
+    error = (picture.astype(float) - expected) ** 2
+    assert 10 * np.log10(255**2 / error.mean()) >= 40
+    assert page.problems == []
+
+
+async def test_points_are_moved_switched_and_gone() -> None:
+    person = captured_person(7)
+    note = "document.getElementById('note').textContent"
+    async with receiver() as (viewer, url), person_moving(viewer), open_page(url, 800, 600) as page:
+        await photograph_when(page, lambda p: coloured(p, SHIRT).sum() > 500)
+        assert not viewer.wants_points
+        await page.press("p")
+        await photograph_when(page, lambda p: coloured(p, SHIRT).sum() == 0)
+        assert "No points yet" in await page.evaluate(note)
+        async with asyncio.timeout(5):
+            while not viewer.wants_points:  # noqa: ASYNC110
+                await asyncio.sleep(0.02)
+        viewer.show_points(link_points(person))
+        first = await photograph_when(page, lambda p: coloured(p, SHIRT).sum() > 500)
+        await photograph_when(page, lambda p: (coloured(p, SKIN) ^ coloured(first, SKIN)).sum() > 200)  # they move
+        assert await page.evaluate(note) == ""
+        viewer.show_points(None)
+        await photograph_when(page, lambda p: coloured(p, SHIRT).sum() == 0)
+        await page.press("p")
+        await photograph_when(page, lambda p: coloured(p, SHIRT).sum() > 500)
+        assert page.problems == []
 
 
 async def camera_of(page: Page, width: int, height: int) -> Camera:

@@ -5,7 +5,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from common.body.cylindrical_map import RADIUS_STEP_M, LinkMaps, closed, project_points, resampled, unproject
+from common.body.cylindrical_map import (
+    RADIUS_STEP_M,
+    LinkMaps,
+    closed,
+    project_points,
+    resampled,
+    unproject,
+    unproject_to_links,
+)
 from common.body.map_layout import map_layout
 from common.body.skeleton import LINK_COUNT, LINK_INDEX
 from common.body.skeleton_pose import forward_kinematics
@@ -154,3 +162,14 @@ def test_a_cloud_through_its_maps_stays_near_itself_and_keeps_its_colours() -> N
     difference = np.abs(colours.astype(int) - cloud.colours[::3][nearest])
     assert np.median(difference, axis=0).max() <= 6
     np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1, atol=1e-4)
+
+
+def test_points_on_their_links_are_the_same_points() -> None:
+    cloud, links = posed_cloud()
+    maps = project_points(LAYOUT, T_WORLD_LINK, links, cloud.positions, cloud.colours)
+    positions, _, colours = unproject(LAYOUT, maps, T_WORLD_LINK)
+    points = unproject_to_links(LAYOUT, maps)
+    np.testing.assert_allclose(points.posed(T_WORLD_LINK), positions, atol=2e-6)
+    np.testing.assert_allclose(points.posed(T_WORLD_LINK[:, :3]), positions, atol=2e-6)
+    np.testing.assert_array_equal(points.colours, colours)
+    assert set(points.links.tolist()) == set(links.tolist())

@@ -13,8 +13,10 @@ import pytest
 from common.geometry.rasterizer import render
 from common.runtime.daemon import Daemon
 from common.runtime.http_access import HttpSettings
-from common.runtime.session_recording import SessionReader, SessionWriter
+from common.runtime.session_recording import SessionReader, SessionWriter, StoredMessage
 from common.transport.channels import CHANNELS
+from common.transport.chunks import ChunkAssembler, decode_chunk
+from common.wire.residual_packet import is_residual
 from common.wire.skeleton_packet import decode_skeleton
 from receiver.cli import run_decode
 from receiver.config import ReceiverSettings, ViewSettings
@@ -54,6 +56,8 @@ def test_a_session_is_the_messages_of_the_channels_in_order(session):
     for message in stored:
         channel = by_channel[message.key.split("/")[3]]
         assert channel.min_bytes <= len(message.payload) <= channel.max_bytes
+    layers = {is_residual(message) for message in whole_messages(stored)}
+    assert layers == {True, False}
     assert {message.key for message in stored} == {
         f"v1/studio/0/{name}" for name in ("skeleton", "body", "bulk/session")
     }
@@ -62,6 +66,13 @@ def test_a_session_is_the_messages_of_the_channels_in_order(session):
     assert len(skeletons) >= FRAMES - 5
     for message in skeletons:
         assert decode_skeleton(message.payload).capture_ns == message.time_ns
+
+
+def whole_messages(stored: list[StoredMessage]) -> list[bytes]:
+    """What the bulk chunks hold."""
+    assembler = ChunkAssembler()
+    chunks = [decode_chunk(message.payload) for message in stored if "/bulk/" in message.key]
+    return [whole for chunk in chunks if (whole := assembler.push(chunk)) is not None]
 
 
 def test_the_same_recording_gives_the_same_file(recording, session, tmp_path):
@@ -114,6 +125,25 @@ def psnr_db(picture: np.ndarray, frame: int) -> float:
     truth = render(performer().surface(time_s), mesh.faces, surface, camera)
     depth = np.where((picture < 250).any(axis=2), np.float32(1), np.float32(0))
     return compare([truth], [(picture, depth)]).psnr_db
+
+
+def test_points_are_decoded_as_pictures_and_clouds(session, tmp_path):
+    points = ReceiverSettings(view=ViewSettings(headless=True, mode="points"))
+    said: list[str] = []
+    assert decode(points, DecodeOptions(session, tmp_path / "png"), said.append) == 0
+    picture = cv2.imread(str(sorted((tmp_path / "png").iterdir())[-1]))[..., ::-1]
+    assert psnr_db(np.ascontiguousarray(picture), FRAMES) > 22  # splats stand out by 12 mm
+    assert decode(points, DecodeOptions(session, tmp_path / "ply", kind="ply", rate_hz=5.0), said.append) == 0
+    cloud = sorted((tmp_path / "ply").iterdir())[-1].read_bytes()
+    head, _, body = cloud.partition(b"end_header\n")
+    rows = np.frombuffer(body, np.dtype([("xyz", "<f4", 3), ("rgb", "u1", 3)]))
+    assert f"element vertex {len(rows)}\n".encode() in head
+    assert len(rows) > 3000
+    surface = performer().surface(FRAMES / RATE_HZ)
+    distances = np.linalg.norm(rows["xyz"][::41, None] - surface[None], axis=2).min(axis=1)
+    assert np.median(distances) < 0.015
+    with pytest.raises(DecodeError, match="written as ply"):
+        decode(points, DecodeOptions(session, tmp_path / "glb", kind="glb"), said.append)
 
 
 @pytest.mark.parametrize("kind", ["ply", "glb"])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -9,7 +10,7 @@ from numpy.typing import NDArray
 from common.geometry.camera_model import Camera
 from receiver.viewer.offscreen_viewer import OffscreenViewer
 from receiver.viewer.viewer import ConnectionState, NullViewer, Viewer, ViewerStatus
-from tests.capsule_person import SHIRT, capsule_person, shown_frame
+from tests.capsule_person import SHIRT, capsule_person, link_points, shown_frame
 
 # In front of the person at 3 m, looking along -Z.
 FRONT = Camera("front", 160, 200, 220.0, 220.0, 79.5, 99.5, np.array(
@@ -69,9 +70,30 @@ def test_removing_another_pose_leaves_the_picture() -> None:
     np.testing.assert_array_equal(seen(viewer)[0], before)
 
 
+def test_in_point_mode_every_skeleton_moves_the_points_and_the_mesh_is_not_shown() -> None:
+    person = capsule_person(1)
+    meshes, points = OffscreenViewer(), OffscreenViewer(mode="points")
+    points.show(shown_frame(person, 0.4))
+    assert points.frame is None
+    assert not seen(points)[1].any()
+    for viewer in (meshes, points):
+        viewer.add_pose(person)
+        viewer.show_points(link_points(person))
+    for time_s in (0.4, 2.3):
+        for viewer in (meshes, points):
+            viewer.show(shown_frame(person, time_s))
+        (_, of_mesh), (_, of_points) = seen(meshes), seen(points)
+        near = cv2.dilate(np.uint8(of_mesh > 0), np.ones((7, 7), np.uint8)) > 0  # a splat, and a bent joint
+        assert (of_points > 0).sum() > 0.3 * (of_mesh > 0).sum()
+        assert ((of_points > 0) & ~near).sum() == 0
+    points.show_points(None)
+    assert not seen(points)[1].any()
+
+
 @pytest.mark.parametrize("viewer", [NullViewer(), OffscreenViewer()], ids=["null", "offscreen"])
 def test_every_viewer_takes_the_same_calls(viewer: Viewer) -> None:
     viewer.add_pose(capsule_person(1))
+    viewer.show_points(link_points(capsule_person(1)))
     viewer.show(shown_frame(capsule_person(1), 0.0))
     viewer.set_status(ViewerStatus(ConnectionState.RECEIVING))
     viewer.remove_pose(1)

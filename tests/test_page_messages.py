@@ -20,7 +20,7 @@ from common.body.vertex_blend import VertexBlend
 from common.geometry.triangle_mesh import TriangleMesh
 from receiver.viewer import page_messages
 from receiver.viewer.viewer import ConnectionState, ViewerStatus
-from tests.capsule_person import SKELETON, capsule_person, shown_frame
+from tests.capsule_person import SKELETON, capsule_person, link_points, shown_frame
 from tests.capsule_views import arms_down_by, capsule_views
 
 PERSON = capsule_person(pose_id=7)
@@ -127,7 +127,7 @@ def test_mesh_that_cannot_be_shown_is_refused(broken: RiggedMesh) -> None:
         page_messages.encode_pose(broken)
 
 
-def test_frame_message_holds_the_frame_in_half_a_megabit() -> None:
+def test_frame_message_holds_the_frame_in_two_thirds_of_a_megabit() -> None:
     frame = shown_frame(PERSON, time_s=1.3, sequence=90)
     frame = dataclasses.replace(frame, confidence=np.linspace(-0.5, 1.5, LINK_COUNT, dtype=np.float32))
     message = page_messages.encode_frame(frame)
@@ -136,13 +136,13 @@ def test_frame_message_holds_the_frame_in_half_a_megabit() -> None:
     assert head[5:] == pytest.approx((frame.sigma, frame.fit_confidence, frame.age_ms))
     motion = np.frombuffer(message, "<f4", 12 * LINK_COUNT, 24).reshape(-1, 3, 4)
     joints = np.frombuffer(message, "<f4", 3 * LINK_COUNT, 24 + 48 * LINK_COUNT).reshape(-1, 3)
-    confidence = np.frombuffer(message, np.uint8, LINK_COUNT, 24 + 60 * LINK_COUNT)
+    confidence = np.frombuffer(message, np.uint8, LINK_COUNT, 24 + 108 * LINK_COUNT)
     np.testing.assert_array_equal(motion, frame.motion)
     np.testing.assert_array_equal(joints, frame.joints)
     assert (confidence[0], confidence[-1]) == (0, 255)
     assert np.abs(confidence / 255 - np.clip(frame.confidence, 0, 1)).max() < 1 / 255
     assert len(message) % 4 == 0
-    assert len(message) * 8 * 30 < 500_000
+    assert len(message) * 8 * 30 < 667_000
 
 
 def test_a_withheld_frame_is_marked() -> None:
@@ -154,6 +154,33 @@ def test_a_withheld_frame_is_marked() -> None:
 def test_frame_without_a_pose_says_so() -> None:
     message = page_messages.encode_frame(shown_frame(None, time_s=0.0))
     assert struct.unpack_from("<I", message, 4)[0] == page_messages.NO_POSE
+
+
+def test_points_message_holds_the_points_on_their_links() -> None:
+    points = link_points(capsule_person(1), every=3)
+    message = page_messages.encode_points(points)
+    count = len(points)
+    version, kind, number, *box, radius = struct.unpack_from("<BBxxI6ff", message)
+    assert (version, kind, number) == (page_messages.VERSION, page_messages.POINTS, count)
+    assert radius == pytest.approx(0.012)
+    position = np.frombuffer(message, "<u2", 3 * count, 36).reshape(-1, 3)
+    np.testing.assert_allclose(box[:3] + position * np.array(box[3:]) / 65535, points.positions, atol=2e-5)
+    begin = len(message) - 4 * count
+    assert begin % 4 == 0
+    colour = np.frombuffer(message, np.uint8, 4 * count, begin).reshape(-1, 4)
+    np.testing.assert_array_equal(colour[:, :3], points.colours)
+    np.testing.assert_array_equal(colour[:, 3], points.links)
+
+
+def test_no_points_are_a_message_too() -> None:
+    assert struct.unpack_from("<BBxxI", page_messages.encode_points(None))[2] == 0
+
+
+@pytest.mark.parametrize("text", ["", "Points", "mesh ", "x" * 1000])
+def test_a_mode_is_one_of_two_or_refused(text: str) -> None:
+    assert [page_messages.decode_mode(mode) for mode in ("mesh", "points")] == ["mesh", "points"]
+    with pytest.raises(ValueError, match="wants to show"):
+        page_messages.decode_mode(text)
 
 
 def test_remove_message_names_the_pose() -> None:
@@ -174,9 +201,11 @@ def test_status_is_json_even_where_numbers_are_missing() -> None:
 
 
 def test_hello_tells_the_link_tree() -> None:
-    hello = json.loads(page_messages.encode_hello("linear"))
+    hello = json.loads(page_messages.encode_hello("linear", "points"))
     version, parents = page_messages.VERSION, list(LINK_PARENTS)
-    assert hello == {"kind": "hello", "version": version, "skinning": "linear", "link_parents": parents}
+    assert hello == {
+        "kind": "hello", "version": version, "skinning": "linear", "mode": "points", "link_parents": parents
+    }  # fmt: skip
 
 
 @given(st.binary(max_size=16))

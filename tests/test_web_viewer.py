@@ -20,10 +20,10 @@ from aiohttp.test_utils import TestServer
 
 from common.body.rigged_mesh import RiggedMesh
 from receiver.viewer import page_messages, web_viewer
-from receiver.viewer.page_messages import FRAME, POSE, REMOVE
+from receiver.viewer.page_messages import FRAME, POINTS, POSE, REMOVE
 from receiver.viewer.viewer import ConnectionState, ViewerStatus
 from receiver.viewer.web_viewer import MESSAGES_UNDER_WAY, WebViewer
-from tests.capsule_person import capsule_person, shown_frame
+from tests.capsule_person import capsule_person, link_points, shown_frame
 
 LIMIT_S = 10.0
 PERSON = capsule_person(pose_id=1)
@@ -181,6 +181,24 @@ async def test_mesh_is_uploaded_once_and_removed_once() -> None:
         served.viewer.remove_pose(1)
         assert await page.binaries(1) == [(REMOVE, 1)]
         assert await page.silent()
+
+
+async def test_points_go_to_pages_that_show_them_newest_first() -> None:
+    async with serve() as served, served.page() as of_mesh, served.page() as of_points:
+        assert not served.viewer.wants_points
+        await of_points.socket.send_str("points")
+        await until(lambda: served.viewer.wants_points)
+        for every in (2, 3):
+            served.viewer.show_points(link_points(PERSON, every))
+        kind, count = (await of_points.binaries(1))[0]
+        assert (kind, count) == (POINTS, len(link_points(PERSON, 3)))
+        served.viewer.show(shown_frame(PERSON, 0.0, 5))
+        assert await of_points.binaries(1) == [(FRAME, 5)]
+        assert await of_mesh.binaries(1) == [(FRAME, 5)]
+        served.viewer.show_points(None)
+        assert await of_points.binaries(1) == [(POINTS, 0)]
+        await of_points.socket.send_str("mesh")
+        await until(lambda: not served.viewer.wants_points)
 
 
 async def test_pose_id_used_again_is_uploaded_again() -> None:

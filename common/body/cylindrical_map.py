@@ -18,6 +18,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from common.body.link_points import LinkPoints
 from common.body.map_layout import MapLayout
 
 RADIUS_STEP_M = 0.002
@@ -79,15 +80,30 @@ def unproject(
 
     A cap's cells get narrow towards its pole: there, of every two, three… the first full one is given.
     """
+    positions, normals, colours, _ = _points(layout, maps, T_world_link)
+    return positions, normals, colours
+
+
+def unproject_to_links(layout: MapLayout, maps: LinkMaps) -> LinkPoints:
+    """The same points, each in its link's own frame."""
+    unmoved = np.tile(np.eye(4, dtype=np.float32), (len(layout.sizes), 1, 1))
+    positions, _, colours, links = _points(layout, maps, unmoved)
+    return LinkPoints(positions, links, colours)
+
+
+def _points(
+    layout: MapLayout, maps: LinkMaps, T_world_link: NDArray[np.float32]
+) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.uint8], NDArray[np.uint8]]:
+    """Positions, outward directions, colours and links of the points ``unproject`` gives."""
     to_world = _into_cylinders(layout, T_world_link)
     R = np.ascontiguousarray(np.swapaxes(to_world[:, :, :3], 1, 2))
     origins = np.ascontiguousarray(T_world_link[:, :3, 3], np.float32)
     most = int(np.count_nonzero(maps.full))
     positions, normals = np.empty((most, 3), np.float32), np.empty((most, 3), np.float32)
-    colours = np.empty((most, 3), np.uint8)
+    colours, links = np.empty((most, 3), np.uint8), np.empty(most, np.uint8)
     n = _points_of(layout.places, layout.sizes, R, origins, maps.full, maps.colour, maps.radius,
-                   positions, normals, colours)  # fmt: skip
-    return positions[:n], normals[:n], colours[:n]
+                   positions, normals, colours, links)  # fmt: skip
+    return positions[:n], normals[:n], colours[:n], links[:n]
 
 
 def _into_cylinders(layout: MapLayout, T_world_link: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -229,7 +245,7 @@ def _resample(places, full, colour, radius, finer, out_full, out_colour, out_rad
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
-def _points_of(places, sizes, R, origins, full, colour, radius, positions, normals, colours):  # type: ignore[no-untyped-def]
+def _points_of(places, sizes, R, origins, full, colour, radius, positions, normals, colours, links):  # type: ignore[no-untyped-def]
     """Fill the arrays with the full cells' points, return how many there are."""
     n = 0
     for link in range(len(places)):
@@ -256,5 +272,6 @@ def _points_of(places, sizes, R, origins, full, colour, radius, positions, norma
                     normals[n, i] = outward
                     positions[n, i] = origins[link, i] + R[link, i, 2] * along + outward * distance
                     colours[n, i] = colour[v, u, i]
+                links[n] = link
                 n += 1
     return n

@@ -12,9 +12,10 @@ from common.geometry.rigid_transform import look_at
 from common.runtime.compute_worker import ComputeWorker
 from common.runtime.stage_timer import StageTimer
 from receiver.viewer.offscreen_viewer import OffscreenViewer
-from receiver.viewer.viewer import ShownFrame, ViewerStatus
+from receiver.viewer.viewer import ShownFrame, ViewerStatus, ViewMode
 
 if TYPE_CHECKING:
+    from common.body.link_points import LinkPoints
     from common.body.rigged_mesh import RiggedMesh
 
 
@@ -25,13 +26,21 @@ def front_camera() -> Camera:
 
 
 class HeadlessScreen:
-    """A ``Viewer`` that renders what it is shown; ``frames_rendered`` counts. All methods are the loop's."""
+    """A ``Viewer`` that renders what it is shown. All methods are the loop's. ``frames_rendered`` counts;
+    ``wants_points``: it has a use for points."""
 
-    def __init__(self, timer: StageTimer, camera: Camera | None = None, skinning: Skinning = "spherical") -> None:
+    def __init__(
+        self,
+        timer: StageTimer,
+        camera: Camera | None = None,
+        skinning: Skinning = "spherical",
+        mode: ViewMode = "mesh",
+    ) -> None:
         self.frames_rendered = 0
+        self.wants_points = mode == "points"
         self._camera = camera or front_camera()
         self._timer = timer
-        self._viewer = OffscreenViewer(skinning)
+        self._viewer = OffscreenViewer(skinning, mode)
         self._rendered: ShownFrame | None = None
         self._renderer = ComputeWorker("render", self._render, self._on_rendered, background=True)
 
@@ -42,6 +51,10 @@ class HeadlessScreen:
     def remove_pose(self, pose_id: int) -> None:
         """Forgets the mesh."""
         self._viewer.remove_pose(pose_id)
+
+    def show_points(self, points: LinkPoints | None) -> None:
+        """The points to move from the next tick on."""
+        self._viewer.show_points(points)
 
     def show(self, frame: ShownFrame) -> None:
         """The frame to render at the next tick."""

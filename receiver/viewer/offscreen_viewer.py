@@ -8,10 +8,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from common.body.link_points import SPLAT_RADIUS_M, LinkPoints
 from common.body.skinning import Skinning, animate
 from common.geometry.camera_model import Camera
+from common.geometry.point_splats import render_points
 from common.geometry.rasterizer import render
-from receiver.viewer.viewer import ShownFrame, ViewerStatus
+from receiver.viewer.viewer import ShownFrame, ViewerStatus, ViewMode
 
 if TYPE_CHECKING:
     from common.body.rigged_mesh import RiggedMesh
@@ -20,14 +22,17 @@ BACKGROUND = 255
 
 
 class OffscreenViewer:
-    """Keeps the poses and the newest frame, as a page does, and renders them when asked.
+    """Keeps the poses, the points and the newest frame, as a page does, and renders one or the other when asked.
 
     ``render`` may be called from another thread than the rest. ``frames_shown`` counts the frames whose pose was
     there; ``status`` is the newest one.
     """
 
-    def __init__(self, skinning: Skinning = "spherical") -> None:
+    def __init__(self, skinning: Skinning = "spherical", mode: ViewMode = "mesh") -> None:
         self._skinning: Skinning = skinning
+        self._mode: ViewMode = mode
+        self._points: LinkPoints | None = None
+        self._newest: ShownFrame | None = None
         self._poses: dict[int, RiggedMesh] = {}
         self._on_screen: tuple[ShownFrame, RiggedMesh] | None = None  # replaced whole, so that threads see both or none
         self.frames_shown = 0
@@ -35,7 +40,9 @@ class OffscreenViewer:
 
     @property
     def frame(self) -> ShownFrame | None:
-        """The frame on screen; None before the first whose pose is here."""
+        """The frame on screen; None before the first whose pose is here, or before there are points."""
+        if self._mode == "points":
+            return None if self._points is None else self._newest
         return None if self._on_screen is None else self._on_screen[0]
 
     def add_pose(self, mesh: RiggedMesh) -> None:
@@ -48,8 +55,13 @@ class OffscreenViewer:
         if self._on_screen is not None and self._on_screen[0].pose_id == pose_id:
             self._on_screen = None
 
+    def show_points(self, points: LinkPoints | None) -> None:
+        """The points to move from now on."""
+        self._points = points
+
     def show(self, frame: ShownFrame) -> None:
         """The frame to render from now on, nobody if it has no pose; while its pose is not here the last one stays."""
+        self._newest = frame
         if frame.pose_id is None:
             self._on_screen = None
         elif frame.pose_id in self._poses:
@@ -65,12 +77,21 @@ class OffscreenViewer:
 
         Depth 0 = nothing there, which is everywhere while nobody is shown.
         """
+        if self._mode == "points":
+            return self._render_points(cameras)
         if (on_screen := self._on_screen) is None:
             return [_nobody(camera) for camera in cameras]
         frame, mesh = on_screen
         assert frame.motion is not None  # as its pose is not
         vertices = animate(mesh, frame.motion, self._skinning)
         return [render(vertices, mesh.faces_drawn, mesh.mesh.surface, camera, BACKGROUND) for camera in cameras]
+
+    def _render_points(self, cameras: Sequence[Camera]) -> list[tuple[NDArray[np.uint8], NDArray[np.float32]]]:
+        points, frame = self._points, self._newest
+        if points is None or frame is None or frame.links is None:
+            return [_nobody(camera) for camera in cameras]
+        positions = points.posed(frame.links)
+        return [render_points(positions, points.colours, camera, SPLAT_RADIUS_M, BACKGROUND) for camera in cameras]
 
 
 def _nobody(camera: Camera) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:

@@ -8,11 +8,15 @@ four bytes, so that the page reads typed arrays in place (``web/src/messages.js`
   corner), ``link u8[V, 4]`` (its link, the neighbour that also moves it, the joint between them, the neighbour's part
   in 1/255), ``joints f32[L, 3]`` at capture, ``index u16[F, 3]`` (u32 if V > 65,536), padding, and the texture as JPEG.
 - FRAME, every skeleton: ``pose_id u32, sequence u32, sigma f32, fit_confidence f32, age_ms f32, motion f32[L, 3, 4],
-  joints f32[L, 3], confidence u8[L]``, padding: 1,432 bytes, 0.34 Mbit/s at 30 Hz. The first of its two zero bytes is
-  1 when it is withheld: the last good picture once more.
+  joints f32[L, 3], links f32[L, 3, 4], confidence u8[L]``, padding: 2,532 bytes, 0.61 Mbit/s at 30 Hz. The first of its
+  two zero bytes is 1 when it is withheld: the last good picture once more. ``links`` (T_world_link) move points.
 - REMOVE: ``pose_id u32``.
+- POINTS, every residual packet, to pages that show points: ``points N u32, box_min f32[3], box_size f32[3], radius f32,
+  position u16[N, 3]`` (0..65535 over the box, in the frame of the point's link), padding, ``colour and link u8[N, 4]``:
+  10 bytes a point. With N = 0 there are none any more.
 
-The page answers each binary message with one ``u32``: how many it has taken in so far.
+The page answers each binary message with one ``u32``: how many it has taken in so far. What it shows, where that is not
+HELLO's ``mode``, it says as the text "points" or "mesh".
 """
 
 from __future__ import annotations
@@ -27,15 +31,16 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from common.body.link_points import SPLAT_RADIUS_M, LinkPoints
 from common.body.skeleton import LINK_COUNT, LINK_PARENTS
 from common.body.skinning import Skinning, captured_joints
-from receiver.viewer.viewer import ShownFrame, ViewerStatus
+from receiver.viewer.viewer import ShownFrame, ViewerStatus, ViewMode
 
 if TYPE_CHECKING:
     from common.body.rigged_mesh import RiggedMesh
 
-VERSION = 4
-POSE, FRAME, REMOVE = 1, 2, 3
+VERSION = 5
+POSE, FRAME, REMOVE, POINTS = 1, 2, 3, 4
 NO_POSE = 0xFFFFFFFF
 QUANTIZATION_STEPS = 65535
 SHORT_INDEX_VERTICES = 65536
@@ -47,6 +52,7 @@ _FRAME_HEADER = struct.Struct("<BB?x")
 _POSE = struct.Struct("<III3f3f")
 _FRAME = struct.Struct("<IIfff")
 _REMOVE = struct.Struct("<I")
+_POINTS = struct.Struct("<I3f3ff")
 _ACKNOWLEDGEMENT = struct.Struct("<I")
 
 
@@ -83,14 +89,28 @@ def encode_frame(frame: ShownFrame) -> bytes:
     motion = np.zeros((LINK_COUNT, 3, 4), np.float32) if frame.motion is None else frame.motion
     head = _FRAME.pack(pose_id, frame.sequence, frame.sigma, frame.fit_confidence, frame.age_ms)
     confidence = np.rint(np.clip(frame.confidence, 0, 1) * 255).astype(np.uint8)
+    links = np.zeros((LINK_COUNT, 3, 4), np.float32) if frame.links is None else frame.links
     parts = (
         _FRAME_HEADER.pack(VERSION, FRAME, frame.withheld),
         head,
         _floats(motion),
         _floats(frame.joints),
+        _floats(links),
         _padded(confidence.tobytes()),
     )
     return b"".join(parts)
+
+
+def encode_points(points: LinkPoints | None) -> bytes:
+    """The POINTS message, positions rounded to 1/65535 of their box: 0.02 mm."""
+    if points is None or len(points) == 0:
+        return _HEADER.pack(VERSION, POINTS) + _POINTS.pack(0, *(0.0,) * 7)
+    box_min = points.positions.min(axis=0)
+    box_size = np.maximum(points.positions.max(axis=0) - box_min, np.float32(1e-6))
+    position = np.rint((points.positions - box_min) * (QUANTIZATION_STEPS / box_size)).astype("<u2")
+    colour = np.concatenate([points.colours, points.links[:, None]], axis=1)
+    head = _HEADER.pack(VERSION, POINTS) + _POINTS.pack(len(points), *box_min, *box_size, SPLAT_RADIUS_M)
+    return b"".join((head, _padded(position.tobytes()), colour.tobytes()))
 
 
 def encode_remove(pose_id: int) -> bytes:
@@ -104,9 +124,11 @@ def encode_status(status: ViewerStatus) -> str:
     return json.dumps({"kind": "status", **figures})
 
 
-def encode_hello(skinning: Skinning) -> str:
-    """The first message to a page: protocol version, how meshes bend, and the link tree its overlay draws."""
-    return json.dumps({"kind": "hello", "version": VERSION, "skinning": skinning, "link_parents": LINK_PARENTS})
+def encode_hello(skinning: Skinning, mode: ViewMode = "mesh") -> str:
+    """The first message to a page: protocol version, how meshes bend, what to show at first, and the link tree that the
+    overlay draws."""
+    about = {"version": VERSION, "skinning": skinning, "mode": mode, "link_parents": LINK_PARENTS}
+    return json.dumps({"kind": "hello", **about})
 
 
 def decode_acknowledgement(message: bytes) -> int:
@@ -118,6 +140,19 @@ def decode_acknowledgement(message: bytes) -> int:
     if len(message) != _ACKNOWLEDGEMENT.size:
         raise ValueError(f"acknowledgement of {len(message)} bytes, expected {_ACKNOWLEDGEMENT.size}")
     return int(_ACKNOWLEDGEMENT.unpack(message)[0])
+
+
+def decode_mode(message: str) -> ViewMode:
+    """What the page shows from now on.
+
+    Raises:
+        ValueError: neither of the two.
+    """
+    if message == "mesh":
+        return "mesh"
+    if message == "points":
+        return "points"
+    raise ValueError(f"it wants to show {message[:20]!r}")
 
 
 def _floats(values: NDArray[np.float32]) -> bytes:

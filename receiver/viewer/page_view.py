@@ -22,6 +22,7 @@ from common.geometry.triangle_mesh import TriangleMesh
 from receiver.viewer.page_messages import (
     FRAME,
     NO_POSE,
+    POINTS,
     POSE,
     QUANTIZATION_STEPS,
     REMOVE,
@@ -117,7 +118,7 @@ class PageView:
             raise ValueError(f"not a message of a page: {text[:40]!r}") from error
 
     def take(self, message: bytes) -> None:
-        """POSE, FRAME or REMOVE.
+        """POSE, FRAME or REMOVE; POINTS are not shown here.
 
         Raises:
             ValueError: malformed.
@@ -136,7 +137,7 @@ class PageView:
             self._show(self._frame)
         elif kind == REMOVE:
             self._remove(struct.unpack_from("<I", message, 4)[0])
-        else:
+        elif kind != POINTS:
             raise ValueError(f"a page message of kind {kind}")
 
     def _show(self, frame: PageFrame) -> None:
@@ -158,7 +159,7 @@ def decode_frame(message: bytes) -> PageFrame:
     Raises:
         ValueError: of another size, or numbers that are not finite.
     """
-    size = 24 + 60 * LINK_COUNT + _padded(LINK_COUNT)
+    size = 24 + 108 * LINK_COUNT + _padded(LINK_COUNT)
     if len(message) != size:
         raise ValueError(f"frame: {len(message)} bytes, expected {size}")
     pose_id, sequence = struct.unpack_from("<II", message, 4)

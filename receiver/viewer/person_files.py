@@ -38,7 +38,19 @@ def write_person(path: Path, person: PagePerson) -> None:
     """
     if (write := _WRITERS.get(path.suffix.lower())) is None:
         raise ExportError(f"{path}: its name ends in none of {', '.join(_WRITERS)}")
-    data = write(person)
+    _write(path, write(person))
+
+
+def write_points(path: Path, positions: NDArray[np.float32], colours: NDArray[np.uint8]) -> None:
+    """Write points (N, 3) [m, world] with colours (N, 3) as binary PLY, whole or not at all.
+
+    Raises:
+        ExportError: a place that cannot be written.
+    """
+    _write(path, _ply_head(len(positions)) + b"end_header\n" + _ply_vertices(positions, colours))
+
+
+def _write(path: Path, data: bytes) -> None:
     unfinished = path.with_name(path.name + ".part")
     try:
         unfinished.write_bytes(data)
@@ -56,17 +68,25 @@ def ply(person: PagePerson) -> bytes:
     height, width = mesh.texture.shape[:2]
     at = mesh.uv[used] * np.array([width, height], np.float32) - np.float32(0.5)
     colour = _sampled(mesh.texture, at)
-    rows = np.empty(len(used), np.dtype([("xyz", "<f4", 3), ("rgb", "u1", 3)]))
-    rows["xyz"], rows["rgb"] = person.vertices()[used], colour
     triangles = np.empty(len(faces), np.dtype([("count", "u1"), ("vertices", "<i4", 3)]))
     triangles["count"], triangles["vertices"] = 3, faces
+    head = f"element face {len(triangles)}\nproperty list uchar int vertex_indices\nend_header\n".encode("ascii")
+    return _ply_head(len(used)) + head + _ply_vertices(person.vertices()[used], colour) + triangles.tobytes()
+
+
+def _ply_head(vertices: int) -> bytes:
     head = (
         "ply\nformat binary_little_endian 1.0\ncomment metres, y up\n"
-        f"element vertex {len(rows)}\nproperty float x\nproperty float y\nproperty float z\n"
+        f"element vertex {vertices}\nproperty float x\nproperty float y\nproperty float z\n"
         "property uchar red\nproperty uchar green\nproperty uchar blue\n"
-        f"element face {len(triangles)}\nproperty list uchar int vertex_indices\nend_header\n"
     )
-    return head.encode("ascii") + rows.tobytes() + triangles.tobytes()
+    return head.encode("ascii")
+
+
+def _ply_vertices(positions: NDArray[np.float32], colours: NDArray[np.uint8]) -> bytes:
+    rows = np.empty(len(positions), np.dtype([("xyz", "<f4", 3), ("rgb", "u1", 3)]))
+    rows["xyz"], rows["rgb"] = positions, colours
+    return rows.tobytes()
 
 
 def glb(person: PagePerson) -> bytes:

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +17,10 @@ from numpy.typing import NDArray
 from common.body.skeleton import LINK_COUNT
 
 if TYPE_CHECKING:
+    from common.body.link_points import LinkPoints
     from common.body.rigged_mesh import RiggedMesh
+
+ViewMode = Literal["mesh", "points"]
 
 
 class ConnectionState(StrEnum):
@@ -36,6 +39,7 @@ class ShownFrame:
     the repository is empty (then ``motion`` is None too and only the joints are known).
     ``motion`` (L, 3, 4) float32: T_world_link(now) · T_link_world(at capture), moves the mesh's world vertices.
     ``joints`` (L, 3) float32 [m, world]: link origins. ``sigma``: distortion score σ of the drawn pose (nan: none).
+    ``links`` (L, 3, 4) float32: T_world_link, moves points; None where nobody needs it.
     ``region_sigma`` (R,) float32: its σ_r by region (``REGION_NAMES``; nan: not seen), None without a pose.
     ``fit_confidence``: 0..1. ``confidence`` (L,) float32: 0 = that link was not seen.
     ``age_ms``: time from capture to this call [ms], nan while the clock offset to the sender is unknown.
@@ -51,6 +55,7 @@ class ShownFrame:
     motion: NDArray[np.float32] | None
     joints: NDArray[np.float32]
     sigma: float
+    links: NDArray[np.float32] | None = field(default=None, kw_only=True)
     region_sigma: NDArray[np.float32] | None = field(default=None, kw_only=True)
     fit_confidence: float
     confidence: NDArray[np.float32]
@@ -62,6 +67,8 @@ class ShownFrame:
             raise ValueError("a shown frame has a pose and its motion, or neither")
         if self.motion is not None and self.motion.shape != (LINK_COUNT, 3, 4):
             raise ValueError(f"motion: expected {(LINK_COUNT, 3, 4)}, got {self.motion.shape}")
+        if self.links is not None and self.links.shape != (LINK_COUNT, 3, 4):
+            raise ValueError(f"links: expected {(LINK_COUNT, 3, 4)}, got {self.links.shape}")
         if self.joints.shape != (LINK_COUNT, 3) or self.confidence.shape != (LINK_COUNT,):
             raise ValueError(f"joints {self.joints.shape}, confidence {self.confidence.shape}: not {LINK_COUNT} links")
 
@@ -89,10 +96,12 @@ class ViewerStatus:
 
 
 class Viewer(Protocol):
-    """Shows one person. Poses are added before the first frame that names them."""
+    """Shows one person, as a mesh or as points. Poses are added before the first frame that names them;
+    ``show_points``: the points that frames move from now on, None: there are none."""
 
     def add_pose(self, mesh: RiggedMesh) -> None: ...
     def remove_pose(self, pose_id: int) -> None: ...
+    def show_points(self, points: LinkPoints | None) -> None: ...
     def show(self, frame: ShownFrame) -> None: ...
     def set_status(self, status: ViewerStatus) -> None: ...
 
@@ -105,6 +114,9 @@ class NullViewer:
 
     def remove_pose(self, pose_id: int) -> None:
         """Ignores the pose."""
+
+    def show_points(self, points: LinkPoints | None) -> None:
+        """Ignores the points."""
 
     def show(self, frame: ShownFrame) -> None:
         """Ignores the frame."""

@@ -21,15 +21,18 @@ from aiohttp import WSCloseCode, WSMsgType, web
 from common.body.skinning import Skinning
 from receiver.viewer.page_messages import (
     decode_acknowledgement,
+    decode_mode,
     encode_frame,
     encode_hello,
+    encode_points,
     encode_pose,
     encode_remove,
     encode_status,
 )
-from receiver.viewer.viewer import ShownFrame, ViewerStatus
+from receiver.viewer.viewer import ShownFrame, ViewerStatus, ViewMode
 
 if TYPE_CHECKING:
+    from common.body.link_points import LinkPoints
     from common.body.rigged_mesh import RiggedMesh
 
 log = logging.getLogger(__name__)
@@ -54,7 +57,7 @@ class WebViewer:
     """A ``Viewer`` whose screens are browsers. All methods are called on the event loop.
 
     ``allowed_hosts``: names a browser may use for this server besides the loopback ones, as ``telepose.lan``.
-    ``skinning``: how meshes bend at their joints.
+    ``skinning``: how meshes bend at their joints. ``mode``: what a page shows until somebody switches.
     """
 
     def __init__(
@@ -63,12 +66,16 @@ class WebViewer:
         allowed_hosts: Iterable[str] = (),
         heartbeat_s: float = HEARTBEAT_S,
         skinning: Skinning = "spherical",
+        mode: ViewMode = "mesh",
     ) -> None:
         self._page_folder = page_folder
         self._allowed_hosts = LOOPBACK_HOSTS | frozenset(allowed_hosts)
         self._heartbeat_s = heartbeat_s
         self._skinning: Skinning = skinning
         self._poses: dict[int, _HeldPose] = {}
+        self._mode: ViewMode = mode
+        self._points: LinkPoints | None = None
+        self._points_message: bytes | None = None  # of these points, once a page needed it
         self._frame: bytes | None = None
         self._pose_on_screen: int | None = None
         self._status = encode_status(ViewerStatus())
@@ -78,6 +85,11 @@ class WebViewer:
     def page_count(self) -> int:
         """Browsers connected now."""
         return len(self._pages)
+
+    @property
+    def wants_points(self) -> bool:
+        """Whether a page shows points."""
+        return any(page.mode == "points" for page in self._pages)
 
     def add_pose(self, mesh: RiggedMesh) -> None:
         """Uploads the mesh to every page once; one that cannot be shown (too large a texture) is logged."""
@@ -89,6 +101,11 @@ class WebViewer:
     def remove_pose(self, pose_id: int) -> None:
         """Frees the mesh on every page."""
         self._poses.pop(pose_id, None)
+        self._wake()
+
+    def show_points(self, points: LinkPoints | None) -> None:
+        """Newest wins, as with frames, for pages that show points."""
+        self._points, self._points_message = points, None
         self._wake()
 
     def show(self, frame: ShownFrame) -> None:
@@ -136,7 +153,7 @@ class WebViewer:
             max_msg_size=64, heartbeat=self._heartbeat_s, timeout=CLOSE_LIMIT_S, compress=False
         )
         await socket.prepare(request)
-        page = _Page(socket)
+        page = _Page(socket, self._mode)
         self._pages.add(page)
         sending = asyncio.create_task(self._keep_up_to_date(page))
         try:
@@ -159,7 +176,7 @@ class WebViewer:
     async def _keep_up_to_date(self, page: _Page) -> None:
         """Sends the page what it lacks, for as long as it is there."""
         try:
-            await page.socket.send_str(encode_hello(self._skinning))
+            await page.socket.send_str(encode_hello(self._skinning, self._mode))
             while True:
                 page.wake.clear()
                 if page.under_way >= MESSAGES_UNDER_WAY or not await self._send_difference(page):
@@ -181,6 +198,10 @@ class WebViewer:
         if missing is not None and message is not None:
             page.poses.add(missing)
             await page.send(message)
+        if page.mode == "points" and page.points is not self._points:
+            page.points = self._points
+            self._points_message = self._points_message or encode_points(self._points)
+            await page.send(self._points_message)
         if self._frame is not None and page.frame is not self._frame:
             page.frame = self._frame
             await page.send(page.frame)
@@ -217,10 +238,12 @@ class _HeldPose:
 
 
 class _Page:
-    """One browser: what it has, and how many messages are under way to it."""
+    """One browser: what it shows, what it has, and how many messages are under way to it."""
 
-    def __init__(self, socket: web.WebSocketResponse) -> None:
+    def __init__(self, socket: web.WebSocketResponse, mode: ViewMode) -> None:
         self.socket = socket
+        self.mode = mode
+        self.points: LinkPoints | None = None
         self.wake = asyncio.Event()
         self.poses: set[int] = set()
         self.frame: bytes | None = None
@@ -240,6 +263,10 @@ class _Page:
         """Until the page leaves, or says something this protocol has no word for."""
         async for message in self.socket:
             try:
+                if message.type is WSMsgType.TEXT:
+                    self.mode = decode_mode(message.data)
+                    self.wake.set()
+                    continue
                 if message.type is not WSMsgType.BINARY:
                     raise ValueError(f"a {message.type.name} message")
                 taken_in = decode_acknowledgement(message.data)

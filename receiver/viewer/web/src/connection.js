@@ -7,18 +7,20 @@ const LONGEST_PAUSE_MS = 4000;
 
 /**
  * Calls `handlers[kind](message)` for each message, `handlers.closed()` whenever the receiver is out of reach, and
- * `handlers.outdated()`, then nothing more, where it speaks another version.
+ * `handlers.outdated()`, then nothing more, where it speaks another version. `send(text)` of what it returns says
+ * something to the receiver, if it is there.
  */
 export function connect(handlers) {
   const url = new URL("ws", location.href);
   url.protocol = url.protocol === "https:" ? "wss:" : "ws:";
   let pauseMs = FIRST_PAUSE_MS;
+  let socket = null;
 
   function dial() {
-    const socket = new WebSocket(url);
+    socket = new WebSocket(url);
     socket.binaryType = "arraybuffer";
     let takenIn = 0;
-    socket.onmessage = ({ data }) => {
+    socket.onmessage = ({ data, target }) => {
       pauseMs = FIRST_PAUSE_MS;
       const message = decodeMessage(data);
       if (message.kind === "hello" && message.version !== VERSION) {
@@ -27,7 +29,7 @@ export function connect(handlers) {
         return handlers.outdated();
       }
       handlers[message.kind](message);
-      if (typeof data !== "string") socket.send(new Uint32Array([++takenIn]));
+      if (typeof data !== "string") target.send(new Uint32Array([++takenIn]));
     };
     socket.onclose = () => {
       handlers.closed();
@@ -36,4 +38,9 @@ export function connect(handlers) {
     };
   }
   dial();
+  return {
+    send(text) {
+      if (socket.readyState === WebSocket.OPEN) socket.send(text);
+    },
+  };
 }

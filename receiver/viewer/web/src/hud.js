@@ -34,7 +34,8 @@ export class Hud {
     document.body.dataset.state = state;
     this.title.textContent = BANNERS[state][0];
     this.detail.textContent = detail || BANNERS[state][1];
-    this.note.textContent = this.live ? detail : "";
+    this.detailNote = this.live ? detail : "";
+    this.writeNote();
   }
 
   setStatus(status) {
@@ -46,6 +47,17 @@ export class Hud {
     this.write("sigma", status.sigma?.toFixed(3));
     this.write("region", this.regions.show(status.region_sigma));
     this.receivedAgeMs = status.pose_age_ms;
+  }
+
+  /** Whether points are to be shown and none are here. */
+  setPointsMissing(missing) {
+    this.pointsMissing = missing;
+    this.writeNote();
+  }
+
+  writeNote() {
+    const missing = this.live && this.pointsMissing ? "No points yet: the sender's [residuals] may be off." : "";
+    this.note.textContent = missing || this.detailNote;
   }
 
   /** Whether the picture is the last good one, since the newest skeleton would tear it. */

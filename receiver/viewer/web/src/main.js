@@ -4,6 +4,7 @@ import "./style.css";
 import { connect } from "./connection.js";
 import { Hud } from "./hud.js";
 import { Person } from "./person.js";
+import { Points } from "./points.js";
 import { SkeletonOverlay } from "./skeleton.js";
 import { Stage } from "./stage.js";
 
@@ -12,16 +13,22 @@ const WITHHELD_PRESENCE = 0.6;
 const hud = new Hud();
 const stage = openStage(document.getElementById("stage"));
 const person = new Person(stage.scene);
+const points = new Points(stage.scene);
 const skeleton = new SkeletonOverlay(stage.scene);
 
 let newest = null; // the frame to draw next; an older one not drawn yet is skipped
 let capturedAt = NaN; // when what is on screen was captured, on this page's clock
 let drawnAt = performance.now();
 let withheld = false; // the last good picture is kept
+let mode = null; // "mesh" or "points": the receiver's choice until somebody's here
+let chosen = null;
 
-connect({
-  hello({ link_parents, skinning }) {
+const receiver = connect({
+  hello({ link_parents, skinning, mode: first }) {
     person.clear(); // a new connection starts with an empty repository
+    points.clear();
+    setMode(chosen ?? first);
+    if (mode !== first) receiver.send(mode);
     person.skinning = skinning;
     skeleton.setLinks(link_parents);
   },
@@ -36,6 +43,10 @@ connect({
   remove({ poseId }) {
     person.remove(poseId);
     stage.changed = true;
+  },
+  points(message) {
+    points.set(message);
+    setMode(mode);
   },
   frame(frame) {
     newest = { ...frame, capturedAt: performance.now() - frame.ageMs };
@@ -57,9 +68,20 @@ function openStage(canvas) {
   }
 }
 
+function setMode(value) {
+  mode = value;
+  document.body.dataset.mode = mode;
+  points.visible = mode === "points";
+  person.visible = mode === "mesh";
+  hud.setPointsMissing(mode === "points" && !points.any);
+  stage.changed = true;
+}
+
 function setPresence() {
-  hud.setWithheld(withheld && hud.live);
-  person.presence = !hud.live ? 0 : withheld ? WITHHELD_PRESENCE : 1;
+  const held = withheld && mode === "mesh"; // points are shown in every posture
+  hud.setWithheld(held && hud.live);
+  person.presence = !hud.live ? 0 : held ? WITHHELD_PRESENCE : 1;
+  points.presence = hud.live ? 1 : 0;
   stage.changed = true;
 }
 
@@ -67,9 +89,10 @@ function draw(now) {
   requestAnimationFrame(draw);
   if (newest) {
     person.show(newest);
+    points.show(newest);
     skeleton.show(newest);
     stage.follow(newest.joints, (now - drawnAt) / 1000);
-    if (!newest.withheld) hud.countFrame();
+    if (!newest.withheld || mode === "points") hud.countFrame();
     withheld = newest.withheld;
     setPresence();
     capturedAt = newest.capturedAt;
@@ -83,6 +106,12 @@ requestAnimationFrame(draw);
 
 const KEYS = {
   s: () => skeleton.toggle(),
+  p() {
+    chosen = mode === "points" ? "mesh" : "points";
+    setMode(chosen);
+    setPresence();
+    receiver.send(chosen);
+  },
   r: () => stage.front(),
   h: () => document.body.classList.toggle("quiet"),
 };

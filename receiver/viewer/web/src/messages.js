@@ -1,7 +1,7 @@
 // The page's end of receiver/viewer/page_messages.py: typed arrays read in place, little-endian.
 
-export const VERSION = 4;
-const KINDS = { 1: decodePose, 2: decodeFrame, 3: decodeRemove };
+export const VERSION = 5;
+const KINDS = { 1: decodePose, 2: decodeFrame, 3: decodeRemove, 4: decodePoints };
 const NO_POSE = 0xffffffff;
 export const LINKS = 23;
 
@@ -44,12 +44,26 @@ function decodeFrame(buffer, view) {
     ageMs: view.getFloat32(20, true),
     motion: new Float32Array(buffer, 24, LINKS * 12),
     joints: new Float32Array(buffer, 24 + LINKS * 48, LINKS * 3),
-    confidence: new Uint8Array(buffer, 24 + LINKS * 60, LINKS),
+    links: new Float32Array(buffer, 24 + LINKS * 60, LINKS * 12),
+    confidence: new Uint8Array(buffer, 24 + LINKS * 108, LINKS),
   };
 }
 
 function decodeRemove(buffer, view) {
   return { kind: "remove", poseId: view.getUint32(4, true) };
+}
+
+function decodePoints(buffer, view) {
+  const count = view.getUint32(4, true);
+  return {
+    kind: "points",
+    count,
+    boxMin: new Float32Array(buffer, 8, 3),
+    boxSize: new Float32Array(buffer, 20, 3),
+    radius: view.getFloat32(32, true),
+    positions: new Uint16Array(buffer, 36, count * 3),
+    colours: new Uint8Array(buffer, 36 + align(count * 6), count * 4),
+  };
 }
 
 function align(bytes) {

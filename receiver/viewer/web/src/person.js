@@ -103,6 +103,10 @@ export class Person {
     for (const [id, mesh] of this.meshes) mesh.visible = id === poseId;
   }
 
+  set visible(value) {
+    this.group.visible = value;
+  }
+
   /** How the mesh bends at its joints: "rigid", "linear" or "spherical". */
   set skinning(name) {
     this.shared.skinning.value = SKINNINGS.indexOf(name);
