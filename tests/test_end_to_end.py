@@ -16,6 +16,7 @@ from scripts.daemon_processes import Running, Site, free_port, site
 
 SHOWN, PUBLISHED = "telepose_frames_shown_total", "telepose_skeletons_published_total"
 POSES = "telepose_repository_poses"
+POINTS = "telepose_points_shown_total"
 SMALL_RIG = ("--width", "320", "--height", "240", "--fps", "15")  # leaves the test machine time for the rest
 
 
@@ -44,6 +45,18 @@ def test_a_person_gets_through_and_both_ends_leave_cleanly(here):
     assert 'site = "studio"' in here.figures("receiver")["settings"]
     kinds = {kind for kind, _, _ in read_show_log(log)}
     assert kinds == {"skeleton", "body", "pose", "frame", "tick"}
+
+
+def test_points_get_through_to_whoever_shows_them_and_come_back(here):
+    here.rig(*SMALL_RIG)
+    sender = here.sender()
+    sender.wait_for(PUBLISHED, 10)
+    assert sender.metric("telepose_residual_packets_sent_total") == 0
+    of_points = here.receiver("--points", name="points")
+    of_points.wait_for(POINTS, 10)
+    sender.wait_for("telepose_residual_level", 100)  # loopback has room for all
+    of_points.end(signal.SIGKILL)
+    here.receiver("--points", name="again").wait_for(POINTS, 5)
 
 
 def test_a_killed_receiver_comes_back_to_the_picture(here):
