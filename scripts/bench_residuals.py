@@ -114,7 +114,7 @@ def _residual(sequence: PosedSequence, method: str, level: float) -> Measured:
         out.encode_s.append(coded - begun)
         out.sizes.append((0 if packet is None else len(packet)) + SKELETON_PACKET_BYTES)
         if k % LOOKED_AT_EVERY == 0:
-            out.likeness[k] = likeness(sequence.cloud(k), shown)
+            out.likeness[k] = likeness(sequence.cloud(k), shown, sequence.height_m)
     return out
 
 
@@ -128,7 +128,7 @@ def _rival(sequence: PosedSequence, encode: Encode) -> Measured:
         out.decode_s.append(time.perf_counter() - begun)
         out.encode_s.append(frame.encode_s)
         out.sizes.append(frame.size_bytes)
-        out.likeness[k] = likeness(sequence.cloud(k), shown)
+        out.likeness[k] = likeness(sequence.cloud(k), shown, sequence.height_m)
     return out
 
 

@@ -52,6 +52,7 @@ class PosedSequence:
     frames: list[PosedViews]
     _sampler: PointSampler = field(init=False)
     _clouds: dict[int, PointCloud] = field(init=False, default_factory=dict)
+    _height_m: float | None = field(init=False, default=None)
 
     def __post_init__(self) -> None:
         self._sampler = PointSampler(self.cameras, POINTS, VOXEL_M)
@@ -84,6 +85,13 @@ class PosedSequence:
         if k not in self._clouds:
             self._clouds[k] = self.points(self.frames[k].views)
         return self._clouds[k]
+
+    @property
+    def height_m(self) -> float:
+        """Of the person in the tallest of one frame in ten."""
+        if self._height_m is None:
+            self._height_m = max(float(np.ptp(self.cloud(k).positions[:, 1])) for k in range(0, self.length, 10))
+        return self._height_m
 
     def residual_frame(self, k: int) -> ResidualFrame:
         """The k-th frame as the residual encoder takes it."""

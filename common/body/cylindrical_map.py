@@ -59,9 +59,8 @@ def project_points(
 def closed(layout: MapLayout, maps: LinkMaps) -> LinkMaps:
     """``maps`` with the gaps between points filled by their neighbours' mean; around a link the grid has no border."""
     out = LinkMaps(maps.full.copy(), maps.colour.copy(), maps.radius.copy())
-    for _ in range(_CLOSING_PASSES):
-        if not _close(layout.places, out.full.copy(), out.full, out.colour, out.radius):
-            break
+    most = (layout.places[:, 2:].max(axis=0) + 2).tolist()
+    _close(layout.places, np.zeros(most, np.uint8), out.full, out.colour, out.radius)
     return out
 
 
@@ -166,41 +165,50 @@ def _gathered(cells, radii, colours, count):  # type: ignore[no-untyped-def]
 
 @njit(nogil=True, cache=True, error_model="numpy")
 def _close(places, before, full, colour, radius):  # type: ignore[no-untyped-def]
-    """Fill cells that were empty ``before`` among at least five full neighbours, in place; returns how many."""
-    filled = 0
+    """Fill empty cells among at least five full neighbours, in place, as long as there are any but at most so often.
+
+    ``before``: room for a grid as it was, with what is around it: the other side left and right, nothing above and
+    below.
+    """
     for link in range(len(places)):
         top, left, rows, columns = places[link]
-        for row in range(rows):
-            up, down = max(row - 1, 0), min(row + 1, rows - 1)
-            for column in range(columns):
-                v, u = top + row, left + column
-                if before[v, u]:
-                    continue
-                west, east = left + (column - 1) % columns, left + (column + 1) % columns
-                if not (before[v, west] or before[v, east] or before[top + up, u] or before[top + down, u]):
-                    continue  # the four at the corners are too few: most of the void is done with here
-                count = np.int64(0)
-                for y in range(top + up, top + down + 1):
-                    count += np.int64(before[y, west]) + np.int64(before[y, u]) + np.int64(before[y, east])
-                if count >= _CLOSING_NEIGHBOURS:
-                    _fill_by_mean(before, full, colour, radius, v, u, (top + up, top + down), (west, u, east))
-                    filled += 1
-    return filled
+        for _ in range(_CLOSING_PASSES):
+            before[0, : columns + 2] = before[rows + 1, : columns + 2] = 0
+            for row in range(rows):
+                for column in range(columns):
+                    before[row + 1, column + 1] = full[top + row, left + column]
+                before[row + 1, 0], before[row + 1, columns + 1] = before[row + 1, columns], before[row + 1, 1]
+            filled = False
+            for row in range(1, rows + 1):
+                for column in range(1, columns + 1):
+                    count = before[row - 1, column] + before[row + 1, column]
+                    count += before[row, column - 1] + before[row, column + 1]
+                    if before[row, column] or count == 0:
+                        continue  # the four at the corners are too few: most of the void is done with here
+                    count += before[row - 1, column - 1] + before[row - 1, column + 1]
+                    count += before[row + 1, column - 1] + before[row + 1, column + 1]
+                    if count >= _CLOSING_NEIGHBOURS:
+                        _fill_by_mean(before, full, colour, radius, row, column, places[link])
+                        filled = True
+            if not filled:
+                break
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
-def _fill_by_mean(before, full, colour, radius, v, u, rows, columns):  # type: ignore[no-untyped-def]
-    """Cell (v, u) becomes the mean of those of ``rows`` (first, last) and ``columns`` that were full ``before``."""
+def _fill_by_mean(before, full, colour, radius, row, column, place):  # type: ignore[no-untyped-def]
+    """The cell at (row, column) of ``before`` becomes the mean of its neighbours that were full then."""
+    top, left, _, columns = place
     count = red = green = blue = steps = np.int64(0)
-    for y in range(rows[0], rows[1] + 1):
-        for x in columns:
+    for y in range(row - 1, row + 2):
+        for x in range(column - 1, column + 2):
             if before[y, x]:
+                v, u = top + y - 1, left + (x - 1) % columns
                 count += 1
-                steps += radius[y, x]
-                red += colour[y, x, 0]
-                green += colour[y, x, 1]
-                blue += colour[y, x, 2]
-    half = count // 2
+                steps += radius[v, u]
+                red += colour[v, u, 0]
+                green += colour[v, u, 1]
+                blue += colour[v, u, 2]
+    half, v, u = count // 2, top + row - 1, left + column - 1
     full[v, u] = True
     radius[v, u] = (steps + half) // count
     colour[v, u, 0], colour[v, u, 1] = (red + half) // count, (green + half) // count

@@ -100,7 +100,8 @@ def decode_maps(
     colour = _decode_colour(sections.colour, height, width, quality.jpeg)
     if reference is not None:
         colour = np.clip(reference.colour.astype(np.int16) + colour - _MIDDLE, 0, 255).astype(np.uint8)
-    return LinkMaps(full, np.where(full[..., None], colour, np.uint8(0)), radius)
+    colour *= full[..., None]
+    return LinkMaps(full, colour, radius)
 
 
 def _encode_radius(layout: MapLayout, maps: LinkMaps, quality: MapQuality, reference: LinkMaps | None) -> bytes:
@@ -205,28 +206,31 @@ def _decode_colour(scan: bytes, height: int, width: int, quality: int) -> NDArra
 
 @njit(nogil=True, cache=True)
 def _fill(values, full, start, out):  # type: ignore[no-untyped-def]
-    """Copies ``values`` (H, W, C) to ``out``; an empty cell gets the mean of its block's full ones, a block without any
-    that of the block before it: no difference to it, which costs a JPEG one bit."""
+    """Copies ``values`` (H, W, C), whole blocks, to ``out``; an empty cell gets the mean of its block's full ones, a
+    block without any that of the block before it: no difference to it, which costs a JPEG one bit."""
     height, width, channels = values.shape
     mean = start.copy()
     sums = np.zeros(channels, np.int64)
     for top in range(0, height, BLOCK):
         for left in range(0, width, BLOCK):
             count = 0
-            sums[:] = 0
-            for v in range(top, min(top + BLOCK, height)):
-                for u in range(left, min(left + BLOCK, width)):
-                    if full[v, u]:
-                        count += 1
-                        for c in range(channels):
-                            sums[c] += values[v, u, c]
+            for v in range(top, top + BLOCK):
+                for u in range(left, left + BLOCK):
+                    count += full[v, u]
             if count:
+                sums[:] = 0
+                for v in range(top, top + BLOCK):
+                    for u in range(left, left + BLOCK):
+                        if full[v, u]:
+                            for c in range(channels):
+                                sums[c] += values[v, u, c]
                 for c in range(channels):
                     mean[c] = sums[c] // count
-            for v in range(top, min(top + BLOCK, height)):
-                for u in range(left, min(left + BLOCK, width)):
+            for v in range(top, top + BLOCK):
+                for u in range(left, left + BLOCK):
+                    kept = full[v, u]
                     for c in range(channels):
-                        out[v, u, c] = values[v, u, c] if full[v, u] else mean[c]
+                        out[v, u, c] = values[v, u, c] if kept else mean[c]
 
 
 @njit(nogil=True, cache=True)
