@@ -21,7 +21,7 @@ import numpy as np
 from common.wire.skeleton_packet import SKELETON_PACKET_BYTES
 from receiver.residual_decoder import ResidualDecoder, cloud
 from scripts.fidelity_capture import FRAME_RATE_HZ, START_S, capture, show_progress
-from scripts.residual_quality import Likeness, likeness
+from scripts.residual_quality import Likeness
 from scripts.residual_rivals import Encode, rivals
 from scripts.residual_sequences import POINTS, PosedSequence, captured_sequence, recorded_sequence
 from scripts.run_bench import Row
@@ -114,7 +114,7 @@ def _residual(sequence: PosedSequence, method: str, level: float) -> Measured:
         out.encode_s.append(coded - begun)
         out.sizes.append((0 if packet is None else len(packet)) + SKELETON_PACKET_BYTES)
         if k % LOOKED_AT_EVERY == 0:
-            out.likeness[k] = likeness(sequence.cloud(k), shown, sequence.height_m)
+            out.likeness[k] = sequence.likeness(k, shown)
     return out
 
 
@@ -128,7 +128,7 @@ def _rival(sequence: PosedSequence, encode: Encode) -> Measured:
         out.decode_s.append(time.perf_counter() - begun)
         out.encode_s.append(frame.encode_s)
         out.sizes.append(frame.size_bytes)
-        out.likeness[k] = likeness(sequence.cloud(k), shown, sequence.height_m)
+        out.likeness[k] = sequence.likeness(k, shown)
     return out
 
 

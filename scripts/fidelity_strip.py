@@ -47,11 +47,11 @@ def main() -> None:
     recorded = capture(options.body, options.motion, options.data, options.cameras, CAPTURED_S,
                        show_progress("capturing"), kept)  # fmt: skip
     instants = [round(float(word) * FRAME_RATE_HZ) for word in options.at.split(",")]
-    rows = [_row("truth", [recorded.truth(k)[options.view][0] for k in instants], [""] * len(instants))]
+    rows = [labelled_row("truth", [recorded.truth(k)[options.view][0] for k in instants], [""] * len(instants))]
     for name in options.methods.split(","):
         own = options.skeleton == "own" and name not in WITHOUT_SKELETON
         pictures, told = _seen(recorded, name, own, options.bandwidth * 1e6, instants, options.view)
-        rows.append(_row(name, pictures, told))
+        rows.append(labelled_row(name, pictures, told))
     strip = cv2.cvtColor(np.vstack(rows), cv2.COLOR_RGB2BGR)
     cv2.imwrite(str(options.out), strip, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
 
@@ -81,7 +81,7 @@ def _seen(
     return pictures, told
 
 
-def _row(name: str, pictures: list[NDArray[np.uint8]], told: list[str]) -> NDArray[np.uint8]:
+def labelled_row(name: str, pictures: list[NDArray[np.uint8]], told: list[str]) -> NDArray[np.uint8]:
     """A label and the pictures' middles, each with what is told of it."""
     height = round(TILE[1] * SCALE)
     label = np.full((height, LABEL_WIDTH, 3), 255, np.uint8)

@@ -21,9 +21,10 @@ def line_chart(
     lines: Mapping[str, Line],
     level: tuple[str, float] | None = None,
     dots: bool = False,
+    low: float = 0.0,
 ) -> str:
-    """SVG of ``lines`` by name, each x values and y values (from 0 up). ``level``: a named height, drawn dashed where
-    it lies inside. ``dots``: mark every value.
+    """SVG of ``lines`` by name, each x values and y values (from ``low`` up). ``level``: a named height, drawn dashed
+    where it lies inside. ``dots``: mark every value.
 
     Raises:
         ValueError: no line has a value.
@@ -32,9 +33,9 @@ def line_chart(
     ys = np.concatenate([np.asarray(y, float) for _, y in lines.values()] or [np.empty(0)])
     if not len(xs):
         raise ValueError(f"chart {title!r} has nothing to show")
-    x_ticks, y_ticks = ticks(float(xs.min()), float(xs.max())), ticks(0.0, float(ys.max()))
+    x_ticks, y_ticks = ticks(float(xs.min()), float(xs.max())), ticks(low, float(ys.max()))
     x_range = min(x_ticks[0], xs.min()), max(x_ticks[-1], xs.max())
-    y_range = 0.0, max(y_ticks[-1], ys.max())
+    y_range = low, max(y_ticks[-1], ys.max())
 
     def place(x: float, y: float) -> tuple[float, float]:
         across = (x - x_range[0]) / (x_range[1] - x_range[0])
@@ -46,7 +47,7 @@ def line_chart(
         x, y = place(x_range[0], value)
         parts += [_stroke([(x, y), (WIDTH - RIGHT, y)], "#ddd", 1), _text(x - 6, y + 4, f"{value:g}", "end")]
     for value in x_ticks:
-        x, y = place(value, 0.0)
+        x, y = place(value, low)
         parts += [_stroke([(x, y), (x, y + 4)], "#888", 1), _text(x, y + 18, f"{value:g}", "middle")]
     parts.append(_text((LEFT + WIDTH - RIGHT) / 2, HEIGHT - 10, x_label, "middle"))
     parts.append(_text(14, (TOP + HEIGHT - BOTTOM) / 2, y_label, "middle", turned=True))

@@ -42,10 +42,11 @@ def fixed_cameras(cloud: PointCloud, height_m: float) -> list[Camera]:
     return measuring_cameras(np.stack([middle, middle]) + np.array([[0, -0.5, 0], [0, 0.5, 0]]) * height_m)
 
 
-def likeness(truth: PointCloud, shown: PointCloud, height_m: float) -> Likeness:
-    """How like ``truth`` a cloud looks from around it; ``height_m``: the tallest in the sequence."""
+def likeness(truth: PointCloud, shown: PointCloud, height_m: float, true: list[Picture] | None = None) -> Likeness:
+    """How like ``truth`` a cloud looks from around it; ``height_m``: the tallest in the sequence. ``true``: the truth's
+    pictures by the fixed cameras, where they are known."""
     cameras = fixed_cameras(truth, height_m)
-    pairs = list(zip(pictures(truth, cameras), pictures(shown, cameras), strict=True))
+    pairs = list(zip(true or pictures(truth, cameras), pictures(shown, cameras), strict=True))
     all_views = compare([a for a, _ in pairs], [b for _, b in pairs]).psnr_db
     return Likeness(all_views, min(compare([a], [b]).psnr_db for a, b in pairs))
 

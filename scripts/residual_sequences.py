@@ -21,7 +21,9 @@ from common.geometry.camera_model import Camera
 from common.geometry.point_cloud import PointCloud
 from common.wire.body_message import SIZE_STEP_M, encode_skeleton_sizes, quantized_skeleton
 from common.wire.skeleton_packet import quantized_pose
+from scripts.fidelity import Picture
 from scripts.fidelity_capture import FRAME_NS, Capture
+from scripts.residual_quality import Likeness, fixed_cameras, likeness, pictures
 from sender.fitting.open_tracker import open_tracker
 from sender.pipeline import BODY_CHANGE_M
 from sender.reconstruction.foreground_points import PointSampler
@@ -52,6 +54,7 @@ class PosedSequence:
     frames: list[PosedViews]
     _sampler: PointSampler = field(init=False)
     _clouds: dict[int, PointCloud] = field(init=False, default_factory=dict)
+    _pictures: dict[int, list[Picture]] = field(init=False, default_factory=dict)
     _height_m: float | None = field(init=False, default=None)
 
     def __post_init__(self) -> None:
@@ -92,6 +95,13 @@ class PosedSequence:
         if self._height_m is None:
             self._height_m = max(float(np.ptp(self.cloud(k).positions[:, 1])) for k in range(0, self.length, 10))
         return self._height_m
+
+    def likeness(self, k: int, shown: PointCloud) -> Likeness:
+        """How like the k-th frame's points a cloud looks."""
+        truth = self.cloud(k)
+        if k not in self._pictures:
+            self._pictures[k] = pictures(truth, fixed_cameras(truth, self.height_m))
+        return likeness(truth, shown, self.height_m, self._pictures[k])
 
     def residual_frame(self, k: int) -> ResidualFrame:
         """The k-th frame as the residual encoder takes it."""

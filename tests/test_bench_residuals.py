@@ -11,9 +11,11 @@ import pytest
 from common.body.skeleton_pose import forward_kinematics
 from common.geometry.point_cloud import PointCloud
 from scripts.bench_residuals import LOOKED_AT_EVERY, POINT_BYTES, _residual, _rival, _rows
+from scripts.residual_figures import frames_chart, rate_chart, residual_clouds
 from scripts.residual_quality import likeness
 from scripts.residual_rivals import filmed, rivals
 from scripts.residual_sequences import PosedSequence, PosedViews, recorded_sequence
+from scripts.run_bench import Row
 from tests.capsule_person import pose_at
 from tests.capsule_views import capsule_views, ring_camera
 from tests.posed_cloud import BODY, posed_cloud
@@ -90,3 +92,21 @@ def test_recordings_are_people_in_the_world(name: str, cameras: int, frames: int
     for link in (3, 4):  # neck and head are among the points
         joint = sequence.frame(0).T_world_link[link, :3, 3]
         assert np.linalg.norm(points - joint, axis=1).min() < 0.25
+
+
+def test_figures_show_every_method_of_the_case_and_every_level() -> None:
+    rows: list[Row] = [
+        Row(case=f"a/b/4/{method}/{n}", metric=metric, value=value * n, unit="", reference=None, source="")
+        for method in ("residual", "yang")
+        for n in (1, 2)
+        for metric, value in (("bytes_per_frame", 900), ("psnr_db", 20.0))
+    ]
+    svg = rate_chart(
+        "a/b/4", [*rows, Row(case="a/b/8/draco/1", metric="psnr_db", value=1, unit="", reference=None, source="")]
+    )
+    assert svg.count("<circle") == 4
+    assert "yang" in svg
+    assert "draco" not in svg
+    sequence = short_sequence()
+    shown = {level: residual_clouds(sequence, level)[0] for level in (0.0, 100.0)}
+    assert frames_chart("capsules", sequence, shown).count("<polyline") >= 2

@@ -49,7 +49,7 @@ def project_points(
     colours: NDArray[np.uint8],
 ) -> LinkMaps:
     """The maps of points (N, 3) [m, world] with ``colours`` (N, 3) RGB, each of one of the posed ``links`` (N,)."""
-    cells, radii = _cells_of(positions, links, _into_cylinders(layout, T_world_link), layout.sizes, layout.places,
+    cells, radii = _cells_of(positions, links, into_cylinders(layout, T_world_link), layout.sizes, layout.places,
                              layout.width)  # fmt: skip
     full, colour, radius = _gathered(cells, radii, colours, layout.height * layout.width)
     shape = layout.height, layout.width
@@ -94,7 +94,7 @@ def _points(
     layout: MapLayout, maps: LinkMaps, T_world_link: NDArray[np.float32]
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.uint8], NDArray[np.uint8]]:
     """Positions, outward directions, colours and links of the points ``unproject`` gives."""
-    to_world = _into_cylinders(layout, T_world_link)
+    to_world = into_cylinders(layout, T_world_link)
     R = np.ascontiguousarray(np.swapaxes(to_world[:, :, :3], 1, 2))
     origins = np.ascontiguousarray(T_world_link[:, :3, 3], np.float32)
     most = int(np.count_nonzero(maps.full))
@@ -105,7 +105,7 @@ def _points(
     return positions[:n], normals[:n], colours[:n], links[:n]
 
 
-def _into_cylinders(layout: MapLayout, T_world_link: NDArray[np.float32]) -> NDArray[np.float32]:
+def into_cylinders(layout: MapLayout, T_world_link: NDArray[np.float32]) -> NDArray[np.float32]:
     """(L, 3, 4): world → front, side and axis coordinates of each posed link's cylinder."""
     R = layout.cylinders @ np.swapaxes(T_world_link[:, :3, :3], 1, 2)
     t = -np.einsum("lij,lj->li", R, T_world_link[:, :3, 3])
@@ -113,28 +113,34 @@ def _into_cylinders(layout: MapLayout, T_world_link: NDArray[np.float32]) -> NDA
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
+def cylinder_coordinates(point, into, length, cap, rows, columns):  # type: ignore[no-untyped-def]
+    """A point's row and column in its link's grid, in cells from the top left corner, its radius [m], and (front, side,
+    beyond) [m]: from the nearest place on the bone, in the cylinder's directions. ``into`` (3, 4): world → cylinder."""
+    x, y, z = point[0], point[1], point[2]
+    front = into[0, 0] * x + into[0, 1] * y + into[0, 2] * z + into[0, 3]
+    side = into[1, 0] * x + into[1, 1] * y + into[1, 2] * z + into[1, 3]
+    along = into[2, 0] * x + into[2, 1] * y + into[2, 2] * z + into[2, 3]
+    across = np.sqrt(front * front + side * side)
+    beyond = along if along < 0 else max(along - length, np.float32(0))
+    turn = np.float32(2 * np.pi)
+    cap_arc = cap * turn / 4
+    height = min(max(along, np.float32(0)), length) + cap * np.float32(np.arctan2(beyond, across))
+    row = (height + cap_arc) / (length + 2 * cap_arc) * rows
+    column = (np.float32(np.arctan2(side, front)) / turn + np.float32(0.5)) * columns
+    return row, column, np.sqrt(across * across + beyond * beyond), (front, side, beyond)
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
 def _cells_of(positions, links, into, sizes, places, width):  # type: ignore[no-untyped-def]
     """Cell in the atlas (N,) int32 and radius (N,) [m] of each point."""
     cells, radii = np.empty(len(positions), np.int32), np.empty(len(positions), np.float32)
-    turn = np.float32(2 * np.pi)
     for n in range(len(positions)):
         link = links[n]
-        m = into[link]
-        x, y, z = positions[n, 0], positions[n, 1], positions[n, 2]
-        front = m[0, 0] * x + m[0, 1] * y + m[0, 2] * z + m[0, 3]
-        side = m[1, 0] * x + m[1, 1] * y + m[1, 2] * z + m[1, 3]
-        along = m[2, 0] * x + m[2, 1] * y + m[2, 2] * z + m[2, 3]
-        length, cap = sizes[link, 0], sizes[link, 1]
-        radius = np.sqrt(front * front + side * side)
-        beyond = along if along < 0 else max(along - length, np.float32(0))
-        height = min(max(along, np.float32(0)), length) + cap * np.float32(np.arctan2(beyond, radius))
-        radii[n] = np.sqrt(radius * radius + beyond * beyond)
         top, left, rows, columns = places[link]
-        cap_arc = cap * turn / 4
-        row = int((height + cap_arc) / (length + 2 * cap_arc) * rows)
-        column = int((np.float32(np.arctan2(side, front)) / turn + np.float32(0.5)) * columns)
-        row, column = min(max(row, 0), rows - 1), min(max(column, 0), columns - 1)
+        y, x, radius, _ = cylinder_coordinates(positions[n], into[link], sizes[link, 0], sizes[link, 1], rows, columns)
+        row, column = min(max(int(y), 0), rows - 1), min(max(int(x), 0), columns - 1)
         cells[n] = (top + row) * width + left + column
+        radii[n] = radius
     return cells, radii
 
 
