@@ -3,7 +3,8 @@
 The mesh (a candidate pose, DISPOSE §5.1) is fine but was captured at another moment; the maps (Lien §5.2) are coarse
 but new. So the mesh is put into the maps' own grid and the difference is taken cell by cell, which leaves what is finer
 than a cell as the mesh has it; it is smoothed against noise and given back to the vertices: along the radius to their
-places, as an offset to the texture's colours. A shirt that slides is dragged along; an elbow that skinning pinches gets its width.
+places, as an offset to the texture's colours. A shirt that slides is dragged along; an elbow that skinning pinches gets
+its width.
 """
 
 from __future__ import annotations
