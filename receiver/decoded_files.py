@@ -11,8 +11,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from common.body.skeleton import LINK_PARENTS
 from common.body.skinning import Skinning
-from common.geometry.camera_model import Camera
+from common.geometry.camera_model import Camera, project
 from common.geometry.rigid_transform import look_at
 from receiver.viewer.offscreen_viewer import OffscreenViewer
 from receiver.viewer.page_messages import encode_frame, encode_hello, encode_pose, encode_remove
@@ -27,6 +28,8 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 DISTANCE_M, EYE_HEIGHT_M, SEEN_HEIGHT_M = 3.5, 1.2, 1.0
+NEAR_M = 0.1
+BONE_COLOUR = (140, 110, 90)
 FOCAL_OF_HEIGHT = 7 / 6  # wide enough for a person with raised arms
 
 
@@ -52,11 +55,12 @@ def camera_before(pelvis: NDArray[np.floating], width: int, height: int, angle_d
 
 
 class _Pictures:
-    """The person rendered offscreen, white where nobody is; the camera stands before where they are first seen."""
+    """The person rendered offscreen on white, as bones while there is no mesh (or no points) to show; the camera stands
+    before where they are first seen."""
 
     def __init__(self, width: int, height: int, angle_deg: float, skinning: Skinning, mode: ViewMode) -> None:
         self.viewer = OffscreenViewer(skinning, mode)
-        self.pictures = self.empty = 0
+        self.pictures = self.bones_only = 0
         self._size = width, height
         self._angle_deg = angle_deg
         self._camera: Camera | None = None
@@ -64,18 +68,31 @@ class _Pictures:
     def _picture(self) -> NDArray[np.uint8]:
         """(H, W, 3) uint8 BGR."""
         self.pictures += 1
-        frame = self.viewer.frame
-        if frame is None:
-            self.empty += 1
+        newest = self.viewer.newest
+        if newest is None:
+            self.bones_only += 1
             return np.full((*self._size[::-1], 3), 255, np.uint8)
         if self._camera is None:
-            self._camera = camera_before(frame.joints[0], *self._size, self._angle_deg)
+            self._camera = camera_before(newest.joints[0], *self._size, self._angle_deg)
         ((colour, _),) = self.viewer.render([self._camera])
-        return np.ascontiguousarray(colour[..., ::-1])
+        picture = np.ascontiguousarray(colour[..., ::-1])
+        if self.viewer.frame is None:
+            self.bones_only += 1
+            draw_bones(picture, newest.joints, self._camera)
+        return picture
 
     def _words(self) -> str:
-        nobody = f", {self.empty} of them with nothing to show yet" if self.empty else ""
-        return f"{self.pictures} pictures{nobody}"
+        bones = f", {self.bones_only} of them of bones alone" if self.bones_only else ""
+        return f"{self.pictures} pictures{bones}"
+
+
+def draw_bones(picture: NDArray[np.uint8], joints: NDArray[np.floating], camera: Camera) -> None:
+    """Lines between joints (L, 3) [m, world] that belong together, into a picture (H, W, 3)."""
+    pixels, z = project(camera, joints)
+    for link, parent in enumerate(LINK_PARENTS):
+        if parent >= 0 and min(z[link], z[parent]) > NEAR_M:
+            ends = [tuple(round(value * 16) for value in pixels[joint]) for joint in (parent, link)]
+            cv2.line(picture, ends[0], ends[1], BONE_COLOUR, 2, cv2.LINE_AA, 4)
 
 
 class VideoFile(_Pictures):

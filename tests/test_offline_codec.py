@@ -27,6 +27,7 @@ from receiver.viewer.page_client import follow
 from scripts.daemon_processes import free_port
 from scripts.fidelity import compare
 from sender.cli import run_encode
+from sender.config import CandidateSettings, ResidualStreamSettings, SenderSettings
 from sender.encode import EncodeError
 from tests.rig_scene import RATE_HZ, performer
 from tests.stored_session import FRAMES, encoded, write_frames
@@ -113,6 +114,19 @@ def test_decoded_pictures_show_the_person_in_the_posture_of_their_frame(session,
     assert [file.name for file in files] == [f"{tick:06d}.png" for tick in range(FRAMES)]
     picture = cv2.imread(str(files[-1]))[..., ::-1]
     assert psnr_db(np.ascontiguousarray(picture), FRAMES) > 25
+
+
+def test_skeletons_without_meshes_are_drawn_as_bones(recording, tmp_path):
+    settings = SenderSettings(poses=CandidateSettings(enabled=False), residuals=ResidualStreamSettings("off"))
+    encoded(recording, tmp_path / "bones.mcap", settings=settings)
+    code, said = decoded(tmp_path / "bones.mcap", tmp_path / "out", rate_hz=2.0)
+    assert code == 0
+    assert "3 pictures, 3 of them of bones alone" in said[0]
+    drawn = (cv2.imread(str(tmp_path / "out" / "000002.png")) < 200).any(axis=2)
+    rows, columns = np.nonzero(drawn)
+    assert 300 < drawn.sum() < 5000
+    assert 250 < np.ptp(rows) < 400  # a standing person, 60 % of the picture's height
+    assert 200 < columns.min() < columns.max() < 440
 
 
 def psnr_db(picture: np.ndarray, frame: int) -> float:

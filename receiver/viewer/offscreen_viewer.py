@@ -45,6 +45,11 @@ class OffscreenViewer:
             return None if self._points is None else self._newest
         return None if self._on_screen is None else self._on_screen[0]
 
+    @property
+    def newest(self) -> ShownFrame | None:
+        """The frame shown last, whether it could be drawn or not."""
+        return self._newest
+
     def add_pose(self, mesh: RiggedMesh) -> None:
         """Keeps the mesh until it is removed."""
         self._poses[mesh.pose_id] = mesh
