@@ -9,9 +9,9 @@ from common.body.skeleton_pose import joint_positions
 from common.geometry.camera_model import project
 from receiver import rehearsal as receiving
 from sender import rehearsal as sending
-from sender.fitting.body_model import _sheet
 from sender.fitting.gauss_newton_tracker import GaussNewtonTracker
 from sender.fitting.limb_search import score_poses
+from sender.fitting.link_cells import sheet
 from sender.pipeline import CandidatePath
 from sender.residual_path import ResidualPath
 
@@ -86,4 +86,4 @@ def test_what_a_session_meets_late_is_rehearsed_too():
     """Kernels that only a lost limb or a noisy surface needs are compiled before the first frame."""
     sending.rehearse_recovery()
     assert score_poses.signatures
-    assert _sheet.signatures
+    assert sheet.signatures

@@ -14,8 +14,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from sender.fitting.closest_point_grid import NEAR_LINKS, Surface, match_points, near_links
 from sender.fitting.joint_limits import JointTable, add_priors, rotation_exp
+from sender.fitting.surface_matching import Surface, match_points, near_links
 
 Array = NDArray[Any]
 
@@ -114,7 +114,7 @@ def normal_equations(
         d0, d1, e2 = points[n, 0] - x0, points[n, 1] - x1, points[n, 2] - x2
         x0, x1, x2 = x0 - c[0], x1 - c[1], x2 - c[2]
         r = n0 * d0 + n1 * d1 + n2 * e2
-        w = surface.weights[k] * (sigma2 / (sigma2 + d2)) ** 2
+        w = (sigma2 / (sigma2 + d2)) ** 2
         J[0], J[1], J[2] = x1 * n2 - x2 * n1, x2 * n0 - x0 * n2, x0 * n1 - x1 * n0
         J[3], J[4], J[5] = n0, n1, n2
         for i in range(6):
@@ -276,7 +276,6 @@ def fit_pose(
     links, size = len(local), 6 + len(table.dof_link)
     H, g = np.empty((links, 6, 6)), np.empty((links, 6))
     A, b = np.empty((size, size)), np.empty(size)
-    near = np.empty((len(points), NEAR_LINKS), np.int8)
     link, row, d2 = np.empty(len(points), np.int64), np.empty(len(points), np.int64), np.empty(len(points))
     scale = 2500.0 / max(len(points), 1) / DATA_SIGMA_M**2
     shrink = (plan.gate_last_m / plan.gate_first_m) ** (1.0 / max(plan.iterations - 1, 1))
@@ -284,8 +283,8 @@ def fit_pose(
     for iteration in range(plan.iterations):
         R, t = forward(root, local, offsets, table.parents)
         if iteration % 3 == 0:
-            near_links(points, R, t, surface, gate + 0.02, near)
-        match_points(points, normals, tinted, near, R, t, surface, link, row, d2)
+            first, members = near_links(points, R, t, surface, gate + 0.02)
+        match_points(points, normals, tinted, first, members, R, t, surface, link, row, d2)
         normal_equations(points, link, row, d2, R, t, surface, gate, plan.point_share, H, g)
         project_on_axes(H, g, R, t, table, scale, A, b)
         add_priors(root, local, predicted.root, predicted.local, table, plan.step_scale, plan.damping, A, b)
@@ -302,10 +301,9 @@ def judge_pose(
     """How well a pose explains a cloud, without moving it (arguments as in ``fit_pose``)."""
     R, t = forward(state.root, state.local, offsets, parents)
     count = len(points)
-    near = np.empty((count, NEAR_LINKS), np.int8)
-    near_links(points, R, t, surface, JUDGED_M, near)
+    first, members = near_links(points, R, t, surface, JUDGED_M)
     link, row, d2 = np.empty(count, np.int64), np.empty(count, np.int64), np.empty(count)
-    match_points(points, normals, tinted, near, R, t, surface, link, row, d2)
+    match_points(points, normals, tinted, first, members, R, t, surface, link, row, d2)
     assigned, explained = np.zeros(len(R)), np.zeros(len(R))
     score, inliers, square = 0.0, 0, 0.0
     for n in range(count):

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from common.geometry.point_cloud import PointCloud
 from sender.fitting.articulated_gauss_newton import FitArrays, PoseState, Schedule, fit_pose, judge_pose
 from sender.fitting.body_model import BodyModel
-from sender.fitting.closest_point_grid import tints
 from sender.fitting.joint_limits import JointTable
+from sender.fitting.surface_matching import tints
 
 Array = NDArray[Any]
 

@@ -17,24 +17,17 @@ from numpy.typing import NDArray
 from common.body.skeleton import LINK_COUNT, LINK_INDEX, LINK_PARENTS, Skeleton
 from common.body.skeleton_pose import bone_segments
 from common.geometry.point_cloud import PointCloud
-from sender.fitting.closest_point_grid import LinkGrid, Surface, build_link_grid, shifted, tints
+from sender.fitting.closest_point_grid import LinkGrid, build_link_grid, shifted
+from sender.fitting.link_cells import COLUMNS, COUNT, MAX_POINTS_PER_LINK, LinkCells
+from sender.fitting.surface_matching import Surface, tints
 
 Array = NDArray[Any]
 
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
 MAX_BYTES = 8_000_000
-MAX_POINTS_PER_LINK = 4_000
-CELL_M = 0.012  # one model point per cell and facing
 GRID_CELL_M, GRID_MARGIN_M = 0.020, 0.06
-THICK_M = 0.010  # standard deviation of a surface's height, by noise or by bending, from which it is thinned
-THICKNESS_SAMPLES = 64
-ALONG, ASIDE = 3, 2  # cells up and down, and to the sides, that count as around a cell
-MEMORY_FRAMES = 90.0  # a cell forgets what is older than about this many observations
-RARE = 0.3  # of the median count of a link's cells: fewer observations are noise
 UNSEEN_REACH = 1.5  # radii from the bone: what is further away may be anything
-CONFIRMED, FADING = 2.0, 0.97  # observations that make a late side surface; what is left of the others each time
-SEAM_WEIGHT = 1.0  # of points that a neighbouring link also claims: they bend with the joint, and help all the same
-SEAM_RATIO = 1.35  # claimed by both when the second bone is at most this much further, in radii
+SEAM_RATIO = 1.35  # near a joint a point is of both bones: the second is at most this much further, in radii
 
 _UNSPLIT = {"fingers": "hand", "toes": "foot"}  # locked joints: their points belong to the link that moves them
 
@@ -49,7 +42,7 @@ class BodyModel:
     def __init__(self, skeleton: Skeleton, match_colours: bool = False) -> None:
         self.skeleton = skeleton
         self.match_colours = match_colours
-        self._cells = [_LinkCells() for _ in range(LINK_COUNT)]
+        self._cells = [LinkCells() for _ in range(LINK_COUNT)]
         self._grids: list[_LinkSurface | None] = [None] * LINK_COUNT
         self._stale = list(range(LINK_COUNT))  # longest waiting first
         self._surface: Surface | None = None
@@ -69,7 +62,7 @@ class BodyModel:
         links = np.concatenate([first, second[seam]])
         rows, links = rows[links % turns == turn], links[links % turns == turn]
         picked = PointCloud(cloud.positions[rows], cloud.normals[rows], cloud.colours[rows])
-        self.add_assigned(picked, T_world_link, links, np.where(seam[rows], SEAM_WEIGHT, 1.0))
+        self.add_assigned(picked, T_world_link, links)
 
     def add_unseen(self, cloud: PointCloud, T_world_link: Array, certain: Array) -> None:
         """Adds points that the surface does not explain so far, a side that turned up late, to those ``certain`` (L,)
@@ -77,7 +70,7 @@ class BodyModel:
         first, _, near, _ = self._nearest_bones(cloud, T_world_link)
         links = np.where(certain[first] & (near < UNSEEN_REACH), first, -1)
         stale = self._stale.copy()
-        self.add_assigned(cloud, T_world_link, links, np.ones(len(links)))
+        self.add_assigned(cloud, T_world_link, links)
         self._stale = stale
         for link in np.unique(links[links >= 0]):
             if self._cells[link].confirm():
@@ -88,14 +81,14 @@ class BodyModel:
         first, second, near, ratio = nearest_bones(cloud.positions, starts, ends, self.skeleton.radii)
         return _MOVER[first], _MOVER[second], near, ratio
 
-    def add_assigned(self, cloud: PointCloud, T_world_link: Array, links: Array, weights: Array) -> None:
-        """Adds points whose link is known: ``links`` (N,) int, -1 = leave out; ``weights`` (N,) 0..1 rigidity."""
+    def add_assigned(self, cloud: PointCloud, T_world_link: Array, links: Array) -> None:
+        """Adds points whose link is known: ``links`` (N,) int, -1 = leave out."""
         for link in np.unique(links[links >= 0]):
             chosen = links == link
             T = T_world_link[link].astype(np.float64)
             points = (cloud.positions[chosen] - T[:3, 3]) @ T[:3, :3]
             normals = cloud.normals[chosen] @ T[:3, :3]
-            self._cells[link].add(points, normals, cloud.colours[chosen].astype(np.float64), weights[chosen])
+            self._cells[link].add(points, normals, cloud.colours[chosen].astype(np.float64))
             self._renew_later(int(link))
 
     def _renew_later(self, link: int) -> None:
@@ -129,9 +122,9 @@ class BodyModel:
         waiting = [link for link in self._stale if self._grids[link] is not None]
         renewed = missing + waiting[: max(refreshed_links - len(missing), 0)]
         for link in renewed:
-            points, normals, rigidity, colours = self._cells[link].surface()
+            points, normals, colours = self._cells[link].surface()
             grid = build_link_grid(points, normals, GRID_CELL_M, GRID_MARGIN_M)
-            self._grids[link] = _LinkSurface(grid, rigidity.astype(np.float32), tints(colours))
+            self._grids[link] = _LinkSurface(grid, tints(colours))
         self._stale = [link for link in self._stale if link not in renewed]
         if renewed or self._surface is None:
             ready = [entry for entry in self._grids if entry is not None]
@@ -167,12 +160,12 @@ class BodyModel:
         if counts.shape != (LINK_COUNT,) or counts.min() < 0 or counts.max() > MAX_POINTS_PER_LINK:
             raise ValueError(f"body model: point counts of {counts.shape} links do not fit {LINK_COUNT} links")
         if (
-            sums.shape != (int(counts.sum()), _COLUMNS)
+            sums.shape != (int(counts.sum()), COLUMNS)
             or not np.isfinite(sums).all()
             or np.abs(sums).max(initial=0) > 1e6
         ):
             raise ValueError(f"body model: points {sums.shape} do not match their counts or are not finite")
-        if len(sums) and sums[:, _COUNT].min() <= 0:
+        if len(sums) and sums[:, COUNT].min() <= 0:
             raise ValueError("body model: a point without observations")
         try:
             body = cls(Skeleton(offsets, tips, radii))
@@ -185,10 +178,9 @@ class BodyModel:
 
 
 class _LinkSurface(NamedTuple):
-    """A link's grid, and of its M points the rigidities (M,) and tints (M, 2), both float32."""
+    """A link's grid, and the tints (M, 2) float32 of its M points."""
 
     grid: LinkGrid
-    rigidity: Array
     tints: Array
 
 
@@ -207,141 +199,6 @@ def _read_archive(data: bytes) -> tuple[Array, ...]:
         raise ValueError(f"body model: not a readable archive ({type(error).__name__}: {error})") from error
 
 
-_POSITION, _NORMAL, _COLOUR, _RIGID, _COUNT, _COLUMNS = slice(0, 3), slice(3, 6), slice(6, 9), 9, 10, 11
-
-
-class _LinkCells:
-    """Running sums of one link's points, keyed by cell and main direction of the normal; rows are sorted by key."""
-
-    def __init__(self) -> None:
-        self.keys = np.empty(0, np.int64)
-        self.sums = np.empty((0, _COLUMNS))
-
-    def add(self, points: Array, normals: Array, colours: Array, rigid: Array) -> None:
-        rows = np.concatenate([points, normals, colours, rigid[:, None], np.ones((len(points), 1))], axis=1)
-        keys = _cell_keys(points, normals)
-        hit = np.unique(keys)
-        fresh = hit[~np.isin(hit, self.keys, assume_unique=True)]
-        at = np.searchsorted(self.keys, fresh)
-        self.keys, self.sums = np.insert(self.keys, at, fresh), np.insert(self.sums, at, 0.0, axis=0)
-        _add_rows(np.searchsorted(self.keys, keys), rows, self.sums)
-        self.sums /= np.maximum(self.sums[:, _COUNT:_COLUMNS] / MEMORY_FRAMES, 1.0)
-        if len(self.keys) > MAX_POINTS_PER_LINK:  # keep what was seen most often
-            kept = np.sort(np.argsort(-self.sums[:, _COUNT], kind="stable")[:MAX_POINTS_PER_LINK])
-            self.keys, self.sums = self.keys[kept], self.sums[kept]
-
-    def restore(self, sums: Array) -> None:
-        points = sums[:, _POSITION] / sums[:, _COUNT:]
-        keys = _cell_keys(points, sums[:, _NORMAL])
-        self.keys, first = np.unique(keys, return_index=True)
-        self.sums = sums[first]
-
-    def _often(self) -> Array:
-        """Which cells were seen often enough (M,) bool."""
-        if not len(self.sums):
-            return np.zeros(0, bool)
-        often: Array = self.sums[:, _COUNT] >= RARE * np.median(self.sums[:, _COUNT])
-        return often
-
-    def confirm(self) -> bool:
-        """Cells seen ``CONFIRMED`` times lately count as often seen; the rest of the rare ones fade. Whether any did
-        the former."""
-        rare = ~self._often()
-        seen = rare & (self.sums[:, _COUNT] >= CONFIRMED)
-        usual = RARE * np.median(self.sums[:, _COUNT]) + 1.0
-        self.sums[seen] *= (usual / self.sums[seen, _COUNT])[:, None]
-        self.sums[rare & ~seen] *= FADING
-        return bool(seen.any())
-
-    def shift(self, by: Array) -> None:
-        """Moves all points ``by`` (3,) [m]; what falls into one cell is one point from then on."""
-        sums = self.sums.copy()
-        sums[:, _POSITION] += sums[:, _COUNT:] * by
-        keys = _cell_keys(sums[:, _POSITION] / sums[:, _COUNT:], sums[:, _NORMAL])
-        self.keys, rows = np.unique(keys, return_inverse=True)
-        self.sums = np.zeros((len(self.keys), _COLUMNS))
-        _add_rows(rows, sums, self.sums)
-
-    def surface(self) -> tuple[Array, Array, Array, Array]:
-        """Points (M, 3) [m, link frame], unit normals (M, 3), rigidities (M,) and colours (M, 3) of the cells that were
-        seen often enough: noise leaves cells that were hit once or twice around the true surface. A thick shell, as
-        noise of a centimetre leaves it, is thinned to one sheet in its middle."""
-        often = self._often()
-        sums = self.sums[often]
-        if _thickness(self.keys, self.sums, often) > THICK_M:
-            sums = _sheet(self.keys, self.sums, often)
-        count = sums[:, _COUNT:]
-        normals = sums[:, _NORMAL] / np.maximum(np.linalg.norm(sums[:, _NORMAL], axis=1, keepdims=True), 1e-9)
-        return sums[:, _POSITION] / count, normals, sums[:, _RIGID] / count[:, 0], sums[:, _COLOUR] / count
-
-
-@njit(nogil=True, cache=True)
-def _add_rows(targets: Array, rows: Array, sums: Array) -> None:
-    for n in range(len(targets)):
-        for column in range(rows.shape[1]):
-            sums[targets[n], column] += rows[n, column]
-
-
-@njit(nogil=True, cache=True, error_model="numpy")
-def _height(keys: Array, sums: Array, n: int) -> tuple[float, float]:
-    """Mean and standard deviation [m] of the height, along its facing, of all that was seen around cell n."""
-    axis = (keys[n] >> 54) // 2
-    steps = np.array([1 << 36, 1 << 18, 1])
-    seen, height, square = 0.0, 0.0, 0.0
-    for u in range(-ASIDE, ASIDE + 1):
-        for v in range(-ASIDE, ASIDE + 1):
-            base = keys[n] + u * steps[(axis + 1) % 3] + v * steps[(axis + 2) % 3]
-            for w in range(-ALONG, ALONG + 1):
-                k = np.searchsorted(keys, base + w * steps[axis])
-                if k < len(keys) and keys[k] == base + w * steps[axis]:
-                    seen += sums[k, _COUNT]
-                    height += sums[k, axis]
-                    square += sums[k, axis] ** 2 / sums[k, _COUNT]
-    height /= seen
-    return height, np.sqrt(max(square / seen - height * height, 0.0))
-
-
-@njit(nogil=True, cache=True, error_model="numpy")
-def _thickness(keys: Array, sums: Array, often: Array) -> float:
-    """Mean standard deviation [m] of a surface's height around some of its cells (N,), ``often`` (N,) bool."""
-    total, count = 0.0, 0
-    for n in range(0, len(keys), max(len(keys) // THICKNESS_SAMPLES, 1)):
-        if often[n]:
-            total += _height(keys, sums, n)[1]
-            count += 1
-    return total / max(count, 1)
-
-
-@njit(nogil=True, cache=True, error_model="numpy")
-def _sheet(keys: Array, sums: Array, often: Array) -> Array:
-    """Sums (M, columns) of the cells that were seen most often of those above and below each other, at the mean height
-    of what is around them; ``keys`` (N,) sorted, ``often`` (N,) bool."""
-    out = np.empty_like(sums)
-    count = 0
-    steps = np.array([1 << 36, 1 << 18, 1])
-    for n in range(len(keys)):
-        axis = (keys[n] >> 54) // 2
-        most = often[n]
-        for w in range(-ALONG, ALONG + 1):
-            key = keys[n] + w * steps[axis]
-            k = np.searchsorted(keys, key)
-            if most and k < len(keys) and keys[k] == key:
-                less = sums[n, _COUNT] - sums[k, _COUNT]
-                most = less > 0.0 or (less == 0.0 and k >= n)
-        if most:
-            out[count] = sums[n]
-            out[count, axis] = _height(keys, sums, n)[0] * sums[n, _COUNT]
-            count += 1
-    return out[:count]
-
-
-def _cell_keys(points: Array, normals: Array) -> Array:
-    cell = np.clip(np.floor(points / CELL_M), -(1 << 17), (1 << 17) - 1).astype(np.int64) + (1 << 17)
-    axis = np.argmax(np.abs(normals), axis=1)
-    facing = 2 * axis + (np.take_along_axis(normals, axis[:, None], 1)[:, 0] < 0)
-    return (((facing << 18 | cell[:, 0]) << 18 | cell[:, 1]) << 18) | cell[:, 2]
-
-
 def _join(links: list[_LinkSurface], match_colours: bool) -> Surface:
     grids = [link.grid for link in links]
     counts = np.array([len(grid.points) for grid in grids])
@@ -353,7 +210,6 @@ def _join(links: list[_LinkSurface], match_colours: bool) -> Surface:
     return Surface(
         points=np.concatenate([grid.points for grid in grids]),
         normals=np.concatenate([grid.normals for grid in grids]),
-        weights=np.concatenate([link.rigidity for link in links]),
         first_point=np.cumsum(counts) - counts,
         origin=np.stack([grid.origin for grid in grids]),
         shape=np.array([grid.nearest.shape[1:] for grid in grids], np.int64),

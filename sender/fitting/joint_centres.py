@@ -27,8 +27,8 @@ from sender.fitting.articulated_gauss_newton import (
     project,
 )
 from sender.fitting.body_fitter import BodyFitter
-from sender.fitting.closest_point_grid import NEAR_LINKS, Surface, match_points, near_links, tints
 from sender.fitting.joint_limits import JointTable, add_priors
+from sender.fitting.surface_matching import Surface, match_points, near_links, tints
 
 Array = NDArray[Any]
 
@@ -115,22 +115,21 @@ def _linearised(
     """Normal equations A (K, K), b (K,) of one cloud: pose axes first, then the displacements of ``joints``."""
     R, t = forward(state.root, state.local, offsets, table.parents)
     count, pose = len(points), 6 + len(table.dof_link)
-    near = np.empty((count, NEAR_LINKS), np.int8)
     link, row, d2 = np.empty(count, np.int64), np.empty(count, np.int64), np.empty(count)
-    near_links(points, R, t, surface, GATE_M, near)
-    match_points(points, normals, tinted, near, R, t, surface, link, row, d2)
+    first, members = near_links(points, R, t, surface, GATE_M)
+    match_points(points, normals, tinted, first, members, R, t, surface, link, row, d2)
     H, g = np.empty((len(R), 6, 6)), np.empty((len(R), 6))
     normal_equations(points, link, row, d2, R, t, surface, GATE_M, POINT_SHARE, H, g)
     size = pose + 6 * len(joints)
     S, moved = np.zeros((size, 6)), np.empty(size, np.int64)
     axis_twists(R, t, table, S, moved)
     for n in range(len(joints)):
-        first, second = pose + 3 * n, pose + 3 * (len(joints) + n)
+        before, after = pose + 3 * n, pose + 3 * (len(joints) + n)
         for axis in range(3):
-            moved[first + axis] = moved[second + axis] = joints[n]
+            moved[before + axis] = moved[after + axis] = joints[n]
             for i in range(3):
-                S[first + axis, 3 + i] = R[table.parents[joints[n]], i, axis]
-                S[second + axis, 3 + i] = -R[joints[n], i, axis]
+                S[before + axis, 3 + i] = R[table.parents[joints[n]], i, axis]
+                S[after + axis, 3 + i] = -R[joints[n], i, axis]
     A, b = np.empty((size, size)), np.empty(size)
     project(H, g, S, moved, table, 2500.0 / max(count, 1) / DATA_SIGMA_M**2, A, b)
     add_priors(state.root, state.local, state.root, state.local, table, LOOSE_STEPS, 1.0, A, b)

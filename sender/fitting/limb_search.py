@@ -24,8 +24,8 @@ from sender.fitting.articulated_gauss_newton import (
     forward,
 )
 from sender.fitting.body_fitter import BodyFitter
-from sender.fitting.closest_point_grid import Surface, match_points, tints
 from sender.fitting.joint_limits import JointTable
+from sender.fitting.surface_matching import Surface, all_near, match_points, tints
 
 Array = NDArray[Any]
 
@@ -162,8 +162,7 @@ def score_poses(
     of ``poses`` (K, 3, 3, 3); ``R, t``: the body's link rotations (L, 3, 3) and joints (L, 3), overwritten for
     ``links``."""
     cost = np.zeros(len(poses))
-    near = np.empty((len(points), len(links)), np.int8)
-    near[:] = links
+    first, members = all_near(len(points), links, len(R))
     hit, row, d2 = np.empty(len(points), np.int64), np.empty(len(points), np.int64), np.empty(len(points))
     for k in range(len(poses)):
         for c in range(len(links)):
@@ -175,7 +174,7 @@ def score_poses(
                     R[link, i, j] = 0.0
                     for m in range(3):
                         R[link, i, j] += R[up, i, m] * poses[k, c, m, j]
-        match_points(points, normals, tinted, near, R, t, surface, hit, row, d2)
+        match_points(points, normals, tinted, first, members, R, t, surface, hit, row, d2)
         for n in range(len(points)):
             cost[k] += d2[n] / (d2[n] + INLIER_M**2) if hit[n] >= 0 else 1.0
         cost[k] /= max(len(points), 1)

@@ -17,7 +17,6 @@ from common.geometry import quaternion
 from common.geometry.point_cloud import PointCloud
 from sender.fitting.articulated_gauss_newton import FitArrays, PoseState, Schedule, forward
 from sender.fitting.body_fitter import BodyFitter
-from sender.fitting.closest_point_grid import tints
 from sender.fitting.joint_limits import JointTable
 from sender.fitting.limb_search import (
     CLEARLY_BETTER,
@@ -31,6 +30,7 @@ from sender.fitting.limb_search import (
     thinned,
     with_limb,
 )
+from sender.fitting.surface_matching import tints
 
 Array = NDArray[Any]
 
