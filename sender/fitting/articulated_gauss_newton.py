@@ -19,6 +19,8 @@ from sender.fitting.surface_matching import Surface, match_points, near_links
 
 Array = NDArray[Any]
 
+DATA_SIGMA_M = 0.05  # of one of 2,500 points, unless a schedule says otherwise
+
 
 class PoseState(NamedTuple):
     """``root`` (3,) float64 [m, world]; ``local`` (L, 3, 3) float64: rotation of each link relative to its parent."""
@@ -28,8 +30,10 @@ class PoseState(NamedTuple):
 
 
 class Schedule(NamedTuple):
-    """How one fit runs. Gates and ``sigma``: metres; ``point_share``: share of plain point-to-point distance beside
-    point-to-plane; ``step_scale``: how many 1/30 s the motion prior spans; ``damping``: added to every axis [rad⁻²]."""
+    """How one fit runs. Gates: metres; ``point_share``: share of plain point-to-point distance beside point-to-plane;
+    ``step_scale``: how many 1/30 s the motion prior spans; ``damping``: added to every axis [rad⁻²]; ``sigma_m``: of
+    one of 2,500 points [m], by which the cloud is weighed against the priors. Neighbours share their errors, so that a
+    point counts for less than its noise alone would say."""
 
     iterations: int
     gate_first_m: float
@@ -37,6 +41,7 @@ class Schedule(NamedTuple):
     point_share: float
     step_scale: float
     damping: float
+    sigma_m: float = DATA_SIGMA_M
 
 
 class FitArrays(NamedTuple):
@@ -56,7 +61,6 @@ class FitArrays(NamedTuple):
 INLIER_M = 0.035
 ALONG_SHARE = 0.2  # how much of the squared distance along the surface counts: model points have gaps between them
 JUDGED_M = 0.10  # points further from the surface than this count as not explained at all
-DATA_SIGMA_M = 0.05  # of one of 2,500 points; neighbours share their errors, so one counts for less than its noise says
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
@@ -277,7 +281,7 @@ def fit_pose(
     H, g = np.empty((links, 6, 6)), np.empty((links, 6))
     A, b = np.empty((size, size)), np.empty(size)
     link, row, d2 = np.empty(len(points), np.int64), np.empty(len(points), np.int64), np.empty(len(points))
-    scale = 2500.0 / max(len(points), 1) / DATA_SIGMA_M**2
+    scale = 2500.0 / max(len(points), 1) / plan.sigma_m**2
     shrink = (plan.gate_last_m / plan.gate_first_m) ** (1.0 / max(plan.iterations - 1, 1))
     gate = plan.gate_first_m
     for iteration in range(plan.iterations):

@@ -52,13 +52,12 @@ class GaussNewtonSettings:
 
 
 HYPOTHESES = (1.0, 0.5, 0.0)  # shares of the last velocity
-GUESS = Schedule(1, 0.20, 0.10, 0.2, 1.0, 1.0)
-COARSE = Schedule(2, 0.15, 0.08, 0.1, 1.0, 1.0)
-FINE = Schedule(2, 0.08, 0.06, 0.1, 1.0, 1.0)
-GUESS_POINTS, COARSE_POINTS, FINE_POINTS = 250, 600, 1250
+GUESS = Schedule(1, 0.20, 0.10, 0.2, 1.0, 1.0, 0.025)
+COARSE = Schedule(2, 0.15, 0.08, 0.1, 1.0, 1.0, 0.025)
+FINE = Schedule(2, 0.08, 0.06, 0.1, 1.0, 1.0, 0.025)
+GUESS_POINTS, COARSE_POINTS, FINE_POINTS = 250, 600, 2500
 NOISY_COARSE = Schedule(2, 0.20, 0.15, 0.1, 1.0, 1.0)  # for noisy clouds: the robust kernel is as wide as the noise
 NOISY_FINE = Schedule(3, 0.15, 0.12, 0.1, 1.0, 1.0)
-NOISY_FINE_POINTS = 2500
 RETRY_FRAMES = 5  # after a limb search in vain
 GUESSED_SIGMA_M, KNOWN_SIGMA_M = 0.04, 0.005  # of joint centres found by the automatic start, and of given ones
 
@@ -122,7 +121,7 @@ class GaussNewtonTracker:
         self._frames += 1
         if self._state is None:
             return self._look(cloud, capture_ns)
-        judged = thinned(cloud, NOISY_FINE_POINTS if self._scale.noisy else FINE_POINTS)
+        judged = thinned(cloud, FINE_POINTS)
         fit = self._follow(cloud, judged, capture_ns)
         self._scale.update(fit.score)
         if fit.score < self._scale.lost:
