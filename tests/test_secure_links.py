@@ -29,9 +29,10 @@ from common.transport.link_settings import LinkSettings
 from common.transport.site_certificate import CertificateError, SiteCertificate, load_site_certificate
 from common.transport.zenoh_session import TransportError, ZenohSession, open_session
 from scripts.daemon_processes import free_port
+from scripts.hostile_peer import outsider, pair
 from scripts.make_certificates import new_authority, new_certificate, write_site
 from scripts.zenoh_router import router_values
-from tests.link_certificates import make_sites, outsider, pair
+from tests.link_certificates import make_sites
 from tests.listening_sockets import listening_ports
 
 ROUTER_FILE = Path(__file__).parents[1] / "deploy" / "router.json5"
