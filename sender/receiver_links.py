@@ -176,9 +176,7 @@ class ReceiverLinks:
 
     def _open(self, name: str, receiver_epoch: int) -> ReceiverLink | None:
         if len(self._links) >= RECEIVERS_MAX:
-            silent = [link for link in self._links.values() if link.away]
-            if silent:
-                self._close(min(silent, key=lambda link: link.heard_ns), "away, and another needs its place")
+            self._make_room(name)
         if self._group is None or len(self._links) >= RECEIVERS_MAX:
             self.counts["refused"] += 1
             return None
@@ -209,6 +207,19 @@ class ReceiverLinks:
         log.info("receiver %s joined", name)
         return link
 
+    def _make_room(self, newcomer: str) -> None:
+        """Close the link that is silent longest; if none is, one of the site that has most, so that none shuts others
+        out."""
+        silent = [link for link in self._links.values() if link.away]
+        if silent:
+            self._close(min(silent, key=lambda link: link.heard_ns), "away, and another needs its place")
+            return
+        sites = Counter(_site(name) for name in self._links)
+        most, count = sites.most_common(1)[0]
+        if count > sites[_site(newcomer)] + 1:
+            link = next(link for link in reversed(self._links.values()) if _site(link.name) == most)
+            self._close(link, f"site {most} has {count}, and another site's receiver needs its place")
+
     def _close(self, link: ReceiverLink, why: str) -> None:
         del self._links[link.name]
         link.task.cancel()
@@ -223,3 +234,8 @@ def _message(chosen: Outgoing | None) -> BulkMessage | None:
     if chosen is None:
         return None
     return BulkMessage(chosen.name, chosen.payload, chosen.supersedes, chosen.urgent)
+
+
+def _site(receiver: str) -> str:
+    """What names the receivers of one certificate have in common."""
+    return receiver.partition(".")[0]

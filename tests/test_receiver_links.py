@@ -210,6 +210,22 @@ async def test_those_away_make_room_for_others():
         assert {link.name for link in bench.links.links} == {f"r{n}" for n in range(1, RECEIVERS_MAX)} | {"new"}
 
 
+async def test_no_site_can_shut_the_others_out():
+    async with running() as bench:
+        for number in range(5 * RECEIVERS_MAX):
+            bench.report(f"wall.{number}")
+        assert len(bench.links.links) == RECEIVERS_MAX
+        for number in range(3):
+            bench.report(f"lobby.{number}")
+        for number in range(5 * RECEIVERS_MAX):
+            bench.report(f"wall.{number}")
+            bench.report("lobby.0")
+        names = {link.name for link in bench.links.links}
+        assert {f"lobby.{number}" for number in range(3)} <= names
+        assert len(names) == RECEIVERS_MAX
+        assert bench.publishers["lobby.0"][0].closed is False
+
+
 async def test_what_a_receiver_tells_is_not_sent_again_and_it_learns_what_there_is():
     async with running() as bench:
         bench.scheduler.offer(2, b"q" * 3000, 2, Quotients({1: 0.5, 2: 0.6}))

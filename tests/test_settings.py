@@ -13,6 +13,7 @@ from common.runtime.config_file import SettingsError, load_settings
 from common.runtime.daemon_options import overrides
 from receiver import cli as receive_cli
 from receiver.config import ReceiverSettings
+from scripts.make_certificates import make
 from sender import cli as send_cli
 from sender.config import SenderSettings
 
@@ -51,6 +52,10 @@ def test_every_commented_key_of_the_example_exists(settings, name, tmp_path):
         ("[poses]\nregion_weights = { thumb = -1 }", "thumb = -1.* is outside"),
         ("[self_view]\nport = 0", r"\[self_view\] port: 0 is outside"),
         ('[link]\nmode = "client"\n[self_view]\nenabled = true', "self_view: needs a link of its own"),
+        ('[link]\ncertificates = "c"', r"receivers: name the sites that may receive"),
+        ('receivers = ["*"]\n[link]\ncertificates = "c"', r"receivers: '\*' has characters"),
+        ('receivers = ["a"]\n[link]\ncertificates = "c"\nlisten = ["tcp/0.0.0.0:1"]', "would not be secured"),
+        ('[link]\nlisten = ["0.0.0.0:7447"]', "is not a locator"),
         ('[link]\nconfig_file = "z.json5"\n[self_view]\nenabled = true', "self_view: name what Zenoh's own file"),
     ],
 )
@@ -76,6 +81,15 @@ def test_the_command_line_goes_over_the_file(tmp_path):
     assert settings.link.connect == ("tcp/192.0.2.7:7447",)
 
 
+def test_a_secured_link_is_one_option_and_needs_no_protocol():
+    given = overrides(send_cli.parse_arguments(["--certificates", "c", "-l", "0.0.0.0:7447", "--receiver", "lobby"]))
+    settings = load_settings(SenderSettings, None, given)
+    assert (settings.link.certificates, settings.link.listen) == (Path("c"), ("0.0.0.0:7447",))
+    assert settings.receivers == ("lobby",)
+    through_router = send_cli.parse_arguments(["--certificates", "c", "-m", "client", "-e", "hub.example:7447"])
+    assert load_settings(SenderSettings, None, overrides(through_router)).receivers == ()
+
+
 def test_a_recording_on_the_command_line_is_the_source():
     options = send_cli.parse_arguments(["--recording", "somewhere", "--as-fast-as-possible"])
     given = send_cli.source_of(overrides(options))
@@ -92,3 +106,21 @@ def test_help_teaches_and_a_wrong_setting_is_one_line(command, tmp_path):
     failed = subprocess.run([BIN / command, "-c", file], capture_output=True, text=True, timeout=30, check=False)
     assert failed.returncode == 1
     assert failed.stderr.strip().splitlines() == [f"{command}: {file}: sight: unknown key; did you mean 'site'?"]
+
+
+@pytest.mark.parametrize(
+    ("command", "site", "complaint"),
+    [
+        (["telepose-send", "--receiver", "wall"], "lobby", "site: 'studio', but the certificate .* is of 'lobby'"),
+        (["telepose-send", "--receiver", "wall"], "nowhere", "ca.pem: No such file or directory"),
+        (["telepose-receive"], "nowhere", "ca.pem: No such file or directory"),
+    ],
+)
+def test_a_certificate_that_does_not_fit_is_one_line(command, site, complaint, tmp_path):
+    make(tmp_path, [("lobby", [])])
+    name, *options = command
+    options += ["--certificates", str(tmp_path / site), "--http-port", "0"]
+    failed = subprocess.run([BIN / name, *options], capture_output=True, text=True, timeout=60, check=False)
+    assert failed.returncode == 1
+    (line,) = failed.stderr.strip().splitlines()
+    assert re.search(complaint, line)

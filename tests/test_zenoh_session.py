@@ -435,6 +435,8 @@ def test_a_dialling_daemon_does_not_listen_and_shared_memory_is_off(endpoint: st
     assert read(config, "connect/endpoints") == [endpoint]
     assert read(config, "mode") == "peer"
     assert read(config, "transport/shared_memory/enabled") is False
+    assert read(config, "transport/unicast/compression") == {"enabled": False}
+    assert read(config, "transport/link/rx/max_message_size") == 1 << 20
     assert read(config, "scouting/multicast/enabled") is False
     assert read(config, "transport/link/tx/lease") == 3000
     assert read(config, "transport/link/protocols") == ["tcp"]

@@ -79,6 +79,8 @@ def _values(settings: LinkSettings, file: zenoh.Config) -> dict[str, Any]:
         "scouting/gossip/enabled": False,
         # On by default, it would carry large payloads around the link that everything here is measured on.
         "transport/shared_memory/enabled": False,
+        # A peer decides what it unpacks to, before anything is known of it.
+        "transport/unicast/compression/enabled": False,
         "transport/unicast/max_links": settings.max_links,
         "transport/unicast/accept_timeout": 1000,
         "transport/link/tx/lease": settings.lease_ms,
