@@ -6,11 +6,12 @@ from functools import lru_cache
 
 from scripts.fidelity_capture import Capture
 from scripts.fidelity_frames import DRACO_LADDER, YANG_LADDER, FrameSizes, PerFrame, draco, yang
+from scripts.fidelity_live import DisposeLive
 from scripts.fidelity_methods import METHODS, Method
 from scripts.fidelity_similarity import Similarity
 from scripts.fidelity_video_methods import Video, WarpedVideo
 
-RIVALS = ("similarity", "per-frame-yang", "per-frame-draco", "h265", "h265-warp")
+RIVALS = ("dispose-live", "similarity", "per-frame-yang", "per-frame-draco", "h265", "h265-warp")
 ALL_METHODS = (*METHODS, *RIVALS)
 WITHOUT_SKELETON = ("per-frame-yang", "per-frame-draco", "h265")  # the same whoever finds the skeleton
 WITHOUT_BANDWIDTH = ("ceiling",)
@@ -27,6 +28,8 @@ def open_method(name: str, recorded: Capture, rate_bps: float, own: bool) -> Met
             return Video(recorded, rate_bps, own)
         case "h265-warp":
             return WarpedVideo(recorded, rate_bps, own)
+        case "dispose-live":
+            return DisposeLive(rate_bps, own)
         case "similarity":
             return Similarity(rate_bps, own)
     return METHODS[name](rate_bps, own)

@@ -12,6 +12,7 @@ from scripts.bench_fidelity import measured
 from scripts.fidelity import compare, measuring_cameras
 from scripts.fidelity_capture import FRAME_RATE_HZ, Capture, capture
 from scripts.fidelity_frames import DRACO_LADDER, YANG_LADDER, Codec, Rung, draco, yang
+from scripts.fidelity_live import DisposeLive
 from scripts.fidelity_methods import LastMesh
 from scripts.fidelity_rivals import open_method
 from scripts.fidelity_surface import pictures_of, reduced, surface_of
@@ -98,3 +99,23 @@ def test_seen_picture_of_a_method_that_is_never_late_is_the_shown_one() -> None:
     figures = measured(LastMesh(40e6, False), recorded(), 1.1)
     assert figures["psnr_seen_db"] == figures["psnr_db"]
     assert figures["first_body_s"][0] == 0
+
+
+def test_live_surface_shares_the_link_with_candidate_poses() -> None:
+    live, frames = DisposeLive(3e6, own=False), 20
+    for k in range(frames):
+        live.frame(k, recorded().frame(k))
+    assert live.screen is not None
+    assert 0 < live.link.sent_bytes <= 3e6 / 8 * (frames + 2) / FRAME_RATE_HZ
+    cameras = measuring_cameras(recorded().performer.surface(recorded().frame(frames - 1).time_s))
+    seen = compare(recorded().truth(frames - 1), live.screen.picture(cameras))
+    assert seen.psnr_db > 19
+    assert seen.iou > 0.9
+
+
+def test_a_thin_link_is_left_to_the_candidate_poses() -> None:
+    thin, poses = DisposeLive(0.2e6, own=False), open_method("dispose", recorded(), 0.2e6, own=False)
+    for k in range(8):
+        thin.frame(k, recorded().frame(k))
+        poses.frame(k, recorded().frame(k))
+    assert thin.link.sent_bytes == poses.link.sent_bytes
