@@ -33,6 +33,7 @@ from common.transport.zenoh_session import ZenohSession, open_session, own_certi
 from common.wire.header import WireError
 from common.wire.receiver_report import WANTS_RESIDUALS
 from common.wire.repository_list import REPOSITORY_LIST_MAX_POSES
+from common.wire.residual_packet import needed_packets
 from common.wire.skeleton_packet import SkeletonPacket
 from receiver.channels_in import Handlers, ReceiverChannels
 from receiver.config import ReceiverSettings
@@ -215,20 +216,25 @@ class _Show:
         self._residuals.put_nowait(message)
 
     async def _make_points(self) -> None:
-        """Residual packets into points, one after the other, as each may need the one before."""
+        """Residual packets into points; of those that wait, only what the newest needs."""
         loop = asyncio.get_running_loop()
         while True:
-            message = await self._residuals.get()
-            bodies = self._channels.stream.bodies
-            try:
-                points = await loop.run_in_executor(self._point_maker, self._point_path.take, message, bodies)
-            except WireError as error:
-                self._counts["residual refused"] += 1
-                log.warning("a residual packet is refused: %s", error)
-                continue
-            if points is not None:
-                self._points_made += 1
-                self.viewer.show_points(points)
+            waiting = [await self._residuals.get()]
+            while not self._residuals.empty():
+                waiting.append(self._residuals.get_nowait())
+            needed = needed_packets(waiting)
+            self._counts["residual overtaken"] += len(waiting) - len(needed)
+            for message in needed:
+                bodies = self._channels.stream.bodies
+                try:
+                    points = await loop.run_in_executor(self._point_maker, self._point_path.take, message, bodies)
+                except WireError as error:
+                    self._counts["residual refused"] += 1
+                    log.warning("a residual packet is refused: %s", error)
+                    continue
+                if points is not None:
+                    self._points_made += 1
+                    self.viewer.show_points(points)
 
     async def _mesh_poses(self) -> None:
         """Mesh candidate poses, one after the other."""

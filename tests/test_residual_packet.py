@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from common.body.cylindrical_map import LinkMaps
-from common.wire.header import WireError
+from common.wire.header import RESIDUAL_VERSION, WireError
 from common.wire.map_codec import MapQuality, reference_of
 from common.wire.residual_packet import (
     RESIDUAL_MAX_BYTES,
@@ -21,6 +21,7 @@ from common.wire.residual_packet import (
     decode_residual,
     decode_residual_header,
     encode_residual,
+    needed_packets,
 )
 from tests.posed_cloud import BODY
 from tests.test_map_codec import LAYOUT, MAPS
@@ -158,3 +159,20 @@ def test_noise_is_refused(data: bytes) -> None:
     for noise in (data, b"\x61" + data, checksummed(b"\x61" + data)):
         with pytest.raises(WireError):
             decode_residual(noise, LAYOUT, None)
+
+
+def test_of_packets_that_wait_only_those_the_newest_needs_are_decoded() -> None:
+    def packet(kind: int, number: int) -> bytes:
+        return bytes([RESIDUAL_VERSION, kind, number])
+
+    key, later_key = packet(0, 0), packet(0, 9)
+    models = [packet(1, number) for number in range(4)]
+    chain = [packet(2, number) for number in range(3)]
+    assert needed_packets([key]) == [key]
+    assert needed_packets(models) == models[-1:]
+    assert needed_packets([models[0], key, *models[1:]]) == [key, models[-1]]
+    assert needed_packets([key, *models, later_key]) == [later_key]
+    assert needed_packets([models[0], key, *chain]) == [key, *chain]
+    assert needed_packets(chain) == chain
+    junk = [b"", b"junk", bytes([RESIDUAL_VERSION]), bytes([RESIDUAL_VERSION, 77])]
+    assert needed_packets([key, *junk]) == [key, *junk]

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import struct
 import zlib
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Literal
@@ -118,6 +119,20 @@ def encode_residual(header: ResidualHeader, layout: MapLayout, maps: LinkMaps, r
 def is_residual(message: bytes) -> bool:
     """Whether a bulk message claims to be a residual packet."""
     return message[:1] == bytes([RESIDUAL_VERSION])
+
+
+def needed_packets(waiting: Sequence[bytes]) -> list[bytes]:
+    """Of packets in the order they came, those that have to be decoded to show the newest: it, and the last key or, of
+    differences from the packet before, all since that key. What is no packet is kept: to be refused by its decoder."""
+    keys = [number for number, packet in enumerate(waiting) if _kind(packet) == "key"]
+    since_key = list(waiting[keys[-1] :] if keys else waiting)
+    if not all(_kind(packet) in ("key", "model") for packet in since_key):
+        return since_key
+    return since_key if len(since_key) == 1 else [*(since_key[:1] if keys else []), since_key[-1]]
+
+
+def _kind(packet: bytes) -> Kind | None:
+    return _KINDS[packet[1]] if is_residual(packet) and len(packet) > 1 and packet[1] < len(_KINDS) else None
 
 
 def decode_residual_header(data: bytes) -> ResidualHeader:
