@@ -51,7 +51,8 @@ class ReceiverLinks:
     where it was, half-sent poses included. Those away make room for others, the one silent longest first.
     ``counts``: opened, closed, refused, away, back, superseded.
 
-    ``open_publisher(name)`` gives the publisher of a receiver's bulk channel; ``on_sent`` is told of every send.
+    ``open_publisher(name)`` gives the publisher of a receiver's bulk channel; ``on_sent`` is told of every pose
+    sent; ``residual_share``: as ``OutgoingBulk``'s share.
     """
 
     def __init__(

@@ -50,7 +50,7 @@ class ResidualPath:
         self._budget_bytes_s = 0.0
         self._interval_ns = 1e9 / frame_rate_hz
         self._last_ns: int | None = None
-        self._smoothed: float | None = None
+        self._smoothed = 0.0
         self._key_wanted = False
 
     def note_budget(self, bytes_per_s: float) -> None:
@@ -89,11 +89,11 @@ class ResidualPath:
 
     def _budget(self, capture_ns: int) -> float:
         """The smoothed budget; takes note of how often frames come."""
-        if self._last_ns is None or self._smoothed is None:
-            self._last_ns, self._smoothed = capture_ns, self._budget_bytes_s
-            return self._smoothed
-        passed_ns = min(max(capture_ns - self._last_ns, 0), LONGEST_INTERVAL_NS)
+        passed_ns = None if self._last_ns is None else capture_ns - self._last_ns
         self._last_ns = capture_ns
+        if passed_ns is None or not 0 < passed_ns < LONGEST_INTERVAL_NS:  # the first frame, or the first after a pause
+            self._smoothed = self._budget_bytes_s
+            return self._smoothed
         self._interval_ns += INTERVAL_MEMORY * (passed_ns - self._interval_ns)
         self._smoothed += (self._budget_bytes_s - self._smoothed) * min(passed_ns / SMOOTHING_NS, 1.0)
         return self._smoothed

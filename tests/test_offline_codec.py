@@ -225,8 +225,9 @@ def test_the_command_lines_say_what_is_wrong(recording, session, tmp_path, capsy
 
 async def test_a_session_plays_in_the_page(session):
     port = free_port()
-    settings = ReceiverSettings(http=HttpSettings(port=port))
-    playing = asyncio.create_task(SessionPage(settings, session, once=True).run(Daemon("test", None)))
+    settings = ReceiverSettings(http=HttpSettings(port=port), view=ViewSettings(mode="points"))
+    page = SessionPage(settings, session, once=True)
+    playing = asyncio.create_task(page.run(Daemon("test", None)))
     sequences = []
     async with asyncio.timeout(30):
         while not sequences:
@@ -238,6 +239,8 @@ async def test_a_session_plays_in_the_page(session):
                     if view.person is not None:
                         sequences.append(view.person.frame.sequence)
                     if sequences and sequences[-1] >= FRAMES - 10:
+                        assert page._viewer.page_count == 1
+                        assert not page._viewer.wants_points  # who follows shows meshes, and says so
                         break
         assert sequences == sorted(sequences)
         await playing

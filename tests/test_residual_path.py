@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -35,6 +37,14 @@ def test_packets_take_what_they_may(bytes_per_s):
     packets = coded(path(), bytes_per_s, frames() * 2)[8:]  # once it is known what a frame takes
     spent = sum(len(packet.data) for packet in packets) / len(packets) * RATE_HZ
     assert spent == pytest.approx(bytes_per_s, rel=0.3)
+
+
+def test_a_pause_does_not_count_as_a_slow_rate():
+    ours = path()
+    before = coded(ours, 60_000, frames() * 2)[-1]
+    later = [replace(frame, capture_ns=frame.capture_ns + 60_000_000_000) for frame in frames()]
+    after = coded(ours, 60_000, later[:3])
+    assert [packet.level for packet in after] == pytest.approx([before.level] * 3, rel=0.25)
 
 
 def test_with_ample_bandwidth_the_level_is_full_and_without_any_only_the_model_goes():
