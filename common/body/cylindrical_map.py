@@ -224,7 +224,7 @@ def _fill_by_mean(before, full, colour, radius, row, column, place):  # type: ig
 @njit(nogil=True, cache=True, error_model="numpy")
 def _resample(places, full, colour, radius, finer, out_full, out_colour, out_radius):  # type: ignore[no-untyped-def]
     """Bilinear between the full cells of ``places``; a cell is full where these weigh at least half."""
-    half = np.float32(0.5)
+    one, half = np.float32(1), np.float32(0.5)
     sums = np.zeros(4, np.float32)
     for link in range(len(places)):
         top, left, rows, columns = places[link]
@@ -237,15 +237,16 @@ def _resample(places, full, colour, radius, finer, out_full, out_colour, out_rad
                 x = (np.float32(column) + half) * np.float32(columns) / np.float32(out_columns) - half
                 x0 = int(np.floor(x))
                 fx = x - np.float32(x0)
+                v0, v1 = top + min(max(y0, 0), rows - 1), top + min(max(y0 + 1, 0), rows - 1)
+                u0, u1 = left + x0 % columns, left + (x0 + 1) % columns
+                if not (full[v0, u0] or full[v0, u1] or full[v1, u0] or full[v1, u1]):
+                    continue  # most of the void
                 weight = np.float32(0)
                 sums[:] = 0
-                for down in range(2):
-                    v = top + min(max(y0 + down, 0), rows - 1)
-                    wy = fy if down else 1 - fy
-                    for across in range(2):
-                        u = left + (x0 + across) % columns
+                for v, wy in ((v0, one - fy), (v1, fy)):
+                    for u, wx in ((u0, one - fx), (u1, fx)):
                         if full[v, u]:
-                            w = wy * (fx if across else 1 - fx)
+                            w = wy * wx
                             weight += w
                             sums[3] += w * radius[v, u]
                             for c in range(3):
