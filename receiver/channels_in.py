@@ -27,6 +27,7 @@ from common.wire.receiver_report import encode_report
 from common.wire.repository_list import RepositoryList, decode_repository_list, encode_repository_list
 from common.wire.residual_packet import is_residual
 from common.wire.skeleton_packet import SkeletonPacket
+from receiver.freshness import Freshness
 from receiver.incoming_stream import IncomingStream
 
 
@@ -58,6 +59,7 @@ class ReceiverChannels:
         self._clock = clock
         self._epoch = epoch
         self._reception = Reception(receiver_id, epoch)
+        self.freshness = Freshness()
         self.first_skeleton_ns: int | None = None  # when the very first one arrived
         self._report = ChannelPublisher(session, channels.REPORT, self._key(channels.REPORT, name))
         self._handlers: Handlers | None = None
@@ -133,7 +135,7 @@ class ReceiverChannels:
             self.first_skeleton_ns = arrival.arrival_ns
         packet = newest.packet
         self._reception.skeleton(packet.epoch, packet.send_ns, arrival.arrival_ns)
-        if newest.body is not None:
+        if newest.body is not None and self.freshness.is_fresh(packet.epoch, packet.send_ns, arrival.arrival_ns):
             self._handlers.skeleton(packet, newest.body, arrival.payload)
 
     def _on_body(self, arrival: Arrival) -> None:

@@ -380,6 +380,7 @@ class _Show:
         chunks = {f"chunk {cause}": count for cause, count in channels.stream.assembler.counts.items()}
         return {
             "animation busy": self._animation.dropped,
+            "skeleton not fresh": channels.freshness.stale,
             **judged,
             **refused,
             **chunks,

@@ -17,8 +17,10 @@ from common.transport.bulk_window import BulkWindow, WindowSettings
 from common.transport.chunks import ChunkAssembler, ChunkError, decode_chunk
 from common.transport.reception import Reception
 from common.wire.receiver_report import ReceiverReport
+from receiver.freshness import Freshness
 from scripts.link_model import Link, LinkConditions
 from scripts.virtual_time import VirtualTimeLoop, run_virtually
+from sender.skeleton_pace import SkeletonPace
 
 MS, S = 1_000_000, 1_000_000_000
 EPOCH = 7
@@ -72,8 +74,9 @@ class _Skeleton:
 class BulkSimulation:
     """One sender and one receiver. ``there``, ``back``: the path's two directions.
 
-    What happened: ``skeletons`` (when sent, how long under way) [ns], ``sent`` and ``arrived`` chunks (when, bytes),
-    ``messages``: whole ones, ``wrong``: of them those that are not what was sent.
+    What happened: ``skeletons`` (when sent, how long under way) [ns], of them ``fresh`` those worth showing,
+    ``divisors`` of their pace (from when, which), ``sent`` and ``arrived`` chunks (when, bytes), ``messages``: whole
+    ones, ``wrong``: of them those that are not what was sent.
     """
 
     def __init__(
@@ -89,11 +92,14 @@ class BulkSimulation:
         self.back = Lane(self.loop, back or there, 2, self._report_arrives)
         self.window = BulkWindow(EPOCH, settings)
         self.sender = BulkSender(self, self.window, EPOCH, self._next_message, self._on_delivered, self.loop)
+        self.pace = SkeletonPace()
         self.receiver_epoch = 1
         self.bulk = True
         self.skeletons: list[tuple[int, int]] = []
         self.sent: list[tuple[int, int]] = []
         self.arrived: list[tuple[int, int]] = []
+        self.fresh: list[tuple[int, int]] = []
+        self.divisors = [(0, 1)]
         self.messages = self.wrong = 0
         self.delivered: list[Hashable] = []
         self._skeleton_hz, self._report_s = skeleton_hz, report_ms / 1e3
@@ -106,6 +112,7 @@ class BulkSimulation:
         self.receiver_epoch += 1
         self._reception = Reception(1, self.receiver_epoch)
         self._assembler = ChunkAssembler()
+        self._freshness = Freshness()
 
     def at(self, seconds: float, action: Callable[[], object]) -> None:
         """Do something at a time of the run."""
@@ -122,7 +129,8 @@ class BulkSimulation:
 
     async def _send_skeletons(self) -> None:
         while self._skeleton_hz:
-            self.there.put(_Skeleton(self.loop.now_ns()), SKELETON_BYTES)
+            if self.pace.due(self.loop.now_ns()):
+                self.there.put(_Skeleton(self.loop.now_ns()), SKELETON_BYTES)
             await asyncio.sleep(1 / self._skeleton_hz)
         await asyncio.Event().wait()
 
@@ -148,6 +156,8 @@ class BulkSimulation:
         now_ns = self.loop.now_ns()
         if isinstance(packet, _Skeleton):
             self.skeletons.append((packet.sent_ns, now_ns - packet.sent_ns))
+            if self._freshness.is_fresh(EPOCH, packet.sent_ns, now_ns + CLOCK_SKEW_NS):
+                self.fresh.append(self.skeletons[-1])
             self._reception.skeleton(EPOCH, packet.sent_ns, now_ns + CLOCK_SKEW_NS)
         elif isinstance(packet, bytes):
             self.arrived.append((now_ns, len(packet)))
@@ -165,6 +175,10 @@ class BulkSimulation:
     def _report_arrives(self, packet: object) -> None:
         assert isinstance(packet, ReceiverReport)
         self.sender.on_report(packet)
+        self.pace.on_report("", packet, self.window.queueing_delay_s, self.window.at_floor, self.loop.now_ns())
+        self.window.trickle = self.pace.divisor > 1
+        if self.divisors[-1][1] != self.pace.divisor:
+            self.divisors.append((self.loop.now_ns(), self.pace.divisor))
 
     def goodput_bps(self, begin_s: float, end_s: float) -> float:
         """Bytes of chunks that arrived, per second."""

@@ -88,7 +88,8 @@ async def send(settings: ProbeSettings) -> dict[str, Any]:
     """The sender's end; what it sent, as JSON."""
     epoch, meshes = secrets.randbits(32), EndlessMeshes()
     sent: list[tuple[int, int]] = []  # sequence number, when [ns]
-    trace: list[tuple[int, int, int, float, float]] = []  # when, window, in flight [bytes], q [ms], rate [bit/s]
+    # When, window and in flight [bytes], q [ms], rate [bit/s], divisor of skeletons.
+    trace: list[tuple[int, int, int, float, float, int]] = []
     allowed = for_sender(SITE, ("lobby",))
     async with open_session(settings.link(), allowed if settings.certificates else ()) as session:
         channels = SenderChannels(session, SITE, 0, CLOCK)
@@ -100,9 +101,10 @@ async def send(settings: ProbeSettings) -> dict[str, Any]:
             due_s, pose, sequence = asyncio.get_running_loop().time(), rest_pose(), 0
             while True:
                 now_ns = CLOCK.now_ns()
-                packet = SkeletonPacket(0, epoch, sequence, now_ns, 1, 1.0, pose, send_delay_ns=0)
-                channels.publish_skeleton(encode_skeleton(packet))
-                sent.append((sequence, now_ns))
+                if links.skeleton_pace.due(now_ns):
+                    packet = SkeletonPacket(0, epoch, sequence, now_ns, 1, 1.0, pose, send_delay_ns=0)
+                    channels.publish_skeleton(encode_skeleton(packet))
+                    sent.append((sequence, now_ns))
                 sequence += 1
                 due_s += FRAME_S
                 await asyncio.sleep(due_s - asyncio.get_running_loop().time())
@@ -111,7 +113,8 @@ async def send(settings: ProbeSettings) -> dict[str, Any]:
             while True:
                 for window in (link.bulk.window for link in links.links):
                     now_ns, q_ms = CLOCK.now_ns(), window.queueing_delay_s * 1e3
-                    trace.append((now_ns, window.window_bytes, window.in_flight_bytes, q_ms, window.rate_bytes_s * 8))
+                    what = window.window_bytes, window.in_flight_bytes, q_ms, window.rate_bytes_s * 8
+                    trace.append((now_ns, *what, links.skeleton_pace.divisor))
                 await asyncio.sleep(REPORT_S)
 
         def obey(line: str) -> None:
@@ -155,6 +158,7 @@ async def receive(settings: ProbeSettings) -> dict[str, Any]:
         task.cancel()
         channels.close()
         counts = channels.stream.skeletons.counts | channels.stream.assembler.counts
+        counts["not fresh"] = channels.freshness.stale
         return {"shown": shown, "bulk": bulk, "meshes": meshes, "counts": counts}
 
 

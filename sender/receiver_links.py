@@ -16,11 +16,12 @@ from common.transport.channel_publisher import ChannelPublisher
 from common.transport.channel_query import Question
 from common.transport.channel_subscriber import Arrival
 from common.transport.channels import receiver_of
-from common.wire.receiver_report import WANTS_RESIDUALS, decode_report
+from common.wire.receiver_report import WANTS_RESIDUALS, ReceiverReport, decode_report
 from common.wire.repository_list import RepositoryList, decode_repository_list, encode_repository_list
 from sender.candidate_poses.mesh_scheduler import MeshScheduler, SendRecord
 from sender.outgoing_bulk import Outgoing, OutgoingBulk, pose_name, poses_in
 from sender.residual_path import Residual
+from sender.skeleton_pace import SkeletonPace
 
 log = logging.getLogger(__name__)
 
@@ -66,6 +67,7 @@ class ReceiverLinks:
     ) -> None:
         self.counts: Counter[str] = Counter()
         self.delivered_poses = 0
+        self.skeleton_pace = SkeletonPace()
         self._residual_counts: Counter[str] = Counter()  # of links that are closed
         self._epoch = epoch
         self._scheduler = scheduler
@@ -97,6 +99,7 @@ class ReceiverLinks:
         for link in self.links:
             if now_ns - link.heard_ns > GONE_AFTER_NS:
                 link.away = True
+                self.skeleton_pace.forget(link.name)
                 self.counts["away"] += 1
                 log.info("receiver %s is away: no reports any more", link.name)
 
@@ -151,6 +154,17 @@ class ReceiverLinks:
         link.heard_ns = arrival.arrival_ns
         link.choice.wants_residuals = bool(report.wants & WANTS_RESIDUALS)
         link.bulk.on_report(report)
+        self._follow_path(link, report)
+
+    def _follow_path(self, link: ReceiverLink, report: ReceiverReport) -> None:
+        """Fewer skeletons, and next to no bulk, where the path cannot even carry the skeletons; and back."""
+        pace, before = self.skeleton_pace, self.skeleton_pace.divisor
+        window = link.bulk.window
+        pace.on_report(link.name, report, window.queueing_delay_s, window.at_floor, link.heard_ns)
+        window.trickle = pace.divisor_of(link.name) > 1
+        if pace.divisor != before:
+            q_ms = window.queueing_delay_s * 1e3
+            log.warning("1 of %d skeletons is sent: receiver %s, %.0f ms of queue", pace.divisor, link.name, q_ms)
 
     def on_repository(self, question: Question) -> bytes:
         """A receiver tells what it has; the answer is what there is here.
@@ -225,6 +239,7 @@ class ReceiverLinks:
         del self._links[link.name]
         link.task.cancel()
         link.publisher.close()
+        self.skeleton_pace.forget(link.name)
         self._scheduler.receiver_left(link.name)
         self._residual_counts += link.choice.counts
         self.counts["closed"] += 1

@@ -40,6 +40,7 @@ REPORT = ReceiverReport(
     body_revision=2,
     repository_poses=42,
     wants=WANTS_RESIDUALS,
+    skeletons=54_321,
 )
 SILENT = replace(
     REPORT, sender_epoch=None, skeleton_send_ns=None, skeleton_delay_ns=None, bulk_delay_ns=None, body_revision=None
@@ -253,6 +254,23 @@ def test_empty_oversized_and_foreign_reports_are_refused() -> None:
 
 def test_the_golden_report_decodes_to_known_values_and_is_what_we_encode() -> None:
     golden = bytes.fromhex(GOLDEN.read_text())
-    expected = (1, 2, 3, 4, 5_000_000_000, 6_000_000_000, 7_000_000, -8_000_000, None, 9_000, 100, (97, 99), 1, 12, 1)
+    expected = (
+        1,
+        2,
+        3,
+        4,
+        5_000_000_000,
+        6_000_000_000,
+        7_000_000,
+        -8_000_000,
+        None,
+        9_000,
+        100,
+        (97, 99),
+        1,
+        12,
+        1,
+        321,
+    )
     assert astuple(decode_report(golden)) == expected
     assert encode_report(ReceiverReport(*expected)) == golden

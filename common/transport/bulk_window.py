@@ -22,6 +22,7 @@ CHUNK_HOLDS_S = 0.005  # how long one chunk may hold up a skeleton behind it on 
 PACING = 1.1  # of the window per round trip: a little more than it allows, so that pacing is not the limit
 BURST_NS = 10_000_000  # how far pacing may lag behind and catch up
 GAIN = 1.5
+TRICKLE_NS = 1_000_000_000  # between two chunks
 SLOW_START_GAIN = 0.5
 LOSS_SHARE = 0.1  # of chunks lost beyond which a queue is taken to be full (GCC, draft-ietf-rmcat-gcc-02 §6)
 
@@ -62,11 +63,13 @@ class Outcome:
 class BulkWindow:
     """The window towards one receiver, for chunks of the sender's run ``epoch``.
 
-    ``counts``: by cause, reports that were not used and chunks that were lost.
+    ``counts``: by cause, reports that were not used and chunks that were lost. ``trickle``, to be set: the path can
+    hardly carry what else is sent, so that only a small chunk goes now and then, one at a time.
     """
 
     def __init__(self, epoch: int, settings: WindowSettings | None = None) -> None:
         self.counts: Counter[str] = Counter()
+        self.trickle = False
         self._epoch = epoch
         self._settings = settings or WindowSettings()
         self._target_s = self._settings.target_ms * 1e-3  # τ
@@ -122,8 +125,15 @@ class BulkWindow:
         return self._window / (self._path.round_trip_s + self._period_s)
 
     @property
+    def at_floor(self) -> bool:
+        """The window is about as small as it gets: there is no more to give way with."""
+        return self.trickle or self._window <= 1.5 * self._least_window
+
+    @property
     def chunk_bytes(self) -> int:
         """C: how large a chunk should be now."""
+        if self.trickle:
+            return CHUNK_LEAST_BYTES
         return int(min(max(self.rate_bytes_s * CHUNK_HOLDS_S, CHUNK_LEAST_BYTES), CHUNK_MAX_BYTES))
 
     def budget_bytes(self, period_ns: int) -> int:
@@ -138,6 +148,9 @@ class BulkWindow:
         """When a chunk of ``size`` bytes may go, perhaps in the past; None: not before another report."""
         if self._silent(now_ns):
             return None
+        if self.trickle:
+            waits = self._in_flight or self._path.queueing_s > 3 * self._target_s
+            return None if waits else self._last_sent_ns + TRICKLE_NS
         if self._in_flight and self._in_flight_bytes + size > self._window:
             return self._probe_ns if self._probe_ns <= now_ns else None
         return self._next_send_ns
@@ -177,10 +190,14 @@ class BulkWindow:
         self._path.update(report, self.chunk_bytes / self.rate_bytes_s, acked_ns, now_ns)
         if outcome.arrived:
             self._progress_ns = now_ns
-        if was_silent:
+        if self.trickle:
+            self._begin_slow_start(0)  # and from the least window once it is over
+            self._clamp()
+        elif was_silent:
             self._begin_anew()
         else:
-            limited = outstanding > self._window / 2  # otherwise the sample says nothing about the path
+            # Otherwise the sample says nothing about the path.
+            limited = outstanding > min(self._window / 2, self._window - self.chunk_bytes)
             if acked and limited and before is not None:
                 period_s = max((report.clock_ns - before[0].clock_ns) * NS, self._period_s / 4)
                 self._rates.append(acked / period_s)
@@ -277,9 +294,11 @@ class BulkWindow:
         if q < target / 2 and self._rates:
             # Where the path delivered more a moment ago, the queue was a hiccup: TCP's own, say (BBR's every 10 s).
             self._window = max(self._window, 0.8 * max(list(self._rates)[-8:]) * round_trip_s)
-        if q > 3 * target and self._rates and not heeded and not self._slow_start:
+        if q > 3 * target and not heeded and not (self._slow_start and self._rates):
             self._reduced_ns = now_ns
-            self._window = min(self._window, 0.85 * self._rates[-1] * round_trip_s)
+            self._slow_start = False
+            delivered = 0.85 * self._rates[-1] * round_trip_s if self._rates else self._window / 2
+            self._window = min(self._window, delivered)
         self._clamp()
         self._seek_room(acked, now_ns)
 
@@ -309,5 +328,9 @@ class BulkWindow:
             self._clamp()
 
     def _clamp(self) -> None:
+        self._window = min(max(self._window, self._least_window), self._settings.max_window_bytes)
+
+    @property
+    def _least_window(self) -> float:
         floor = self._settings.floor_bps / 8 * (self._path.round_trip_s + self._period_s)
-        self._window = min(max(self._window, 2 * self.chunk_bytes, floor), self._settings.max_window_bytes)
+        return max(floor, self.chunk_bytes)

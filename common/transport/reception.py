@@ -20,12 +20,14 @@ class Reception:
         self._arrivals = BulkArrivals()
         self._skeleton_delay, self._bulk_delay = LeastDelay(), LeastDelay()
         self._skeleton: tuple[int, int] | None = None  # the newest one: when sent, when it arrived
+        self._skeletons = 0
 
     def skeleton(self, epoch: int, send_ns: int, arrival_ns: int) -> None:
         """The newest skeleton so far arrived. Times by the sender's clock and by the receiver's."""
         if epoch != self._sender_epoch:
             self._begin(epoch)
         self._skeleton = send_ns, arrival_ns
+        self._skeletons += 1
         self._skeleton_delay.note(send_ns, arrival_ns)
 
     def chunk(self, chunk: Chunk, size: int, arrival_ns: int) -> None:
@@ -55,4 +57,5 @@ class Reception:
             body_revision=body_revision,
             repository_poses=repository_poses,
             wants=wants,
+            skeletons=self._skeletons,
         )
