@@ -18,7 +18,7 @@ from common.transport.chunks import OutgoingMessage
 from common.wire.receiver_report import ReceiverReport
 
 PERIOD_NS = 250_000_000  # of the budget told to whoever chooses the next message
-UNDER_WAY_MAX = 8  # messages begun and not yet acknowledged
+UNDER_WAY_MAX = 32  # messages begun and not yet acknowledged: as many as a receiver puts together at a time
 EXPIRY_S = 0.25  # how often to look for chunks that are never acknowledged
 BURST_CHUNKS = 16  # sent in one turn of the loop at most
 

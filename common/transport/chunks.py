@@ -200,7 +200,7 @@ class ChunkAssembler:
     a chunk goes first. ``counts``: by cause, what was refused or given up.
     """
 
-    def __init__(self, max_messages: int = 8, max_bytes: int = 4 * MESSAGE_MAX_BYTES) -> None:
+    def __init__(self, max_messages: int = 32, max_bytes: int = 4 * MESSAGE_MAX_BYTES) -> None:
         self.counts: Counter[str] = Counter()
         self.epoch: int | None = None
         self._max_messages = max_messages
