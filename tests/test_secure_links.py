@@ -20,7 +20,7 @@ import zenoh
 
 from common.runtime.clock import MonotonicClock
 from common.transport import channels
-from common.transport.access_rules import for_receiver, for_sender, receivers_of
+from common.transport.access_rules import Allowance, for_receiver, for_sender, receivers_of
 from common.transport.channel_publisher import ChannelPublisher
 from common.transport.channel_query import ChannelQueryable, ask
 from common.transport.channel_subscriber import Arrival, ChannelSubscriber
@@ -329,6 +329,30 @@ async def test_what_is_wrong_with_a_certificate_is_said(tmp_path: Path, what: st
     with pytest.raises(CertificateError, match=complaint):
         async with open_session(LinkSettings(certificates=folder, connect=("127.0.0.1:1",))):
             pass
+
+
+async def test_the_self_view_s_socket_needs_no_certificate_and_opens_nothing_else(sites: Path, tmp_path: Path) -> None:
+    """It is the one link that is not secured: a Unix socket in a folder of the sender's own."""
+    port, local = free_port(), f"unixsock-stream/{tmp_path / 'link'}"
+    settings = LinkSettings(certificates=sites / "studio", listen=(f"127.0.0.1:{port}", local))
+    allowed = (*for_sender("studio", ["lobby"]), Allowance("studio", "receiver", "self", link="unixsock-stream"))
+    async with (
+        open_session(settings, allowed) as studio,
+        open_session(LinkSettings(connect=(local,))) as own,
+        open_session(dialling(sites, port), for_receiver("studio", NAME)) as lobby,
+    ):
+        skeleton = ChannelPublisher(studio, SKELETON, key(SKELETON))
+        bulk = {name: ChannelPublisher(studio, BULK, key(BULK, name)) for name in ("self", NAME)}
+        heard = [Heard(session, SKELETON, key(SKELETON)) for session in (own, lobby)]
+        own_chunks, others_chunks = Heard(own, BULK, key(BULK, "self")), Heard(own, BULK, key(BULK, NAME))
+        async with asyncio.timeout(10):
+            while not (all(each.payloads for each in heard) and own_chunks.payloads):
+                skeleton.put(b"skeleton")
+                for name, publisher in bulk.items():
+                    publisher.put(name.encode() + bytes(100))
+                await asyncio.sleep(0.02)
+        assert set(own_chunks.payloads) == {b"self" + bytes(100)}
+        assert others_chunks.payloads == []
 
 
 async def test_sites_meet_at_a_router_each_with_its_own_keys(sites: Path, tmp_path: Path) -> None:
