@@ -19,6 +19,7 @@ import pytest
 import zenoh
 
 from common.runtime.clock import MonotonicClock
+from common.runtime.metrics import Metrics
 from common.transport import channels
 from common.transport.access_rules import Allowance, for_receiver, for_sender, receivers_of
 from common.transport.channel_publisher import ChannelPublisher
@@ -160,6 +161,21 @@ async def test_a_server_with_another_name_is_not_talked_to(sites: Path) -> None:
         assert list(server.zenoh.info.links()) == list(lobby.zenoh.info.links()) == []
 
 
+async def test_how_long_a_certificate_lasts_is_a_metric_and_a_warning(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    authority = new_authority()
+    for name, days in (("studio", 300), ("lobby", 20)):
+        write_site(tmp_path / name, authority, *new_certificate(authority, name, ["127.0.0.1"], days))
+    async with stream(tmp_path) as made:
+        metrics = Metrics()
+        made.studio.add_metrics(metrics)
+        assert "certificate_days_left 299.9" in metrics.text().decode()
+    warnings = [record.getMessage() for record in caplog.records if "expires on" in record.getMessage()]
+    assert len(warnings) == 1
+    assert str(tmp_path / "lobby" / "certificate.pem") in warnings[0]
+
+
 @pytest.mark.parametrize("site", ["rogue", "wall", "lobby"])
 async def test_a_valid_certificate_opens_no_foreign_keys_in_either_direction(sites: Path, site: str) -> None:
     """A rogue has no part in the stream, a wall none in the lobby's; a lobby may not speak for the studio."""
@@ -213,7 +229,7 @@ def test_a_name_that_only_begins_like_another_is_another() -> None:
 async def test_a_link_ends_with_its_certificate(sites: Path, tmp_path: Path) -> None:
     authority = new_authority()
     write_site(tmp_path / "studio", authority, *new_certificate(authority, "studio", ["127.0.0.1"]))
-    lasts = timedelta(seconds=3)
+    lasts = timedelta(seconds=5)
     write_site(tmp_path / "lobby", authority, *new_certificate(authority, "lobby", days=lasts / timedelta(days=1)))
     async with stream(tmp_path) as made:
         await until(lambda: not list(made.studio.zenoh.info.transports()))

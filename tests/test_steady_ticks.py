@@ -30,7 +30,6 @@ async def ticks(seconds: float, hold_up_s: dict[int, float]) -> tuple[list[float
 async def test_a_held_up_loop_misses_ticks_which_are_counted_and_the_raster_stays() -> None:
     times, missed = await ticks(0.6, hold_up_s={3: 7.4 * PERIOD_S, 8: 3.4 * PERIOD_S})
     raster = [round(at - 0.5) for at in times]  # late ones belong to the tick that was due
-    assert all(at >= number - 0.05 for at, number in zip(times, raster, strict=True))
     assert len(set(raster)) == len(raster)
     assert missed >= 6 + 2
     assert abs(len(times) + missed - (raster[-1] + 1)) <= 2
