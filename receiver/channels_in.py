@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 
 from common.body.skeleton import Skeleton
 from common.runtime.clock import Clock
@@ -45,10 +46,19 @@ class Handlers:
 
 
 class ReceiverChannels:
-    """One person's incoming stream. ``counts``: answers to questions that were malformed."""
+    """One person's incoming stream. ``counts``: answers to questions that were malformed. ``record(key, time_ns,
+    payload)`` is told of all that arrives."""
 
     def __init__(
-        self, session: ZenohSession, site: str, person: int, name: str, receiver_id: int, epoch: int, clock: Clock
+        self,
+        session: ZenohSession,
+        site: str,
+        person: int,
+        name: str,
+        receiver_id: int,
+        epoch: int,
+        clock: Clock,
+        record: Callable[[str, int, bytes], None] = lambda *_: None,
     ) -> None:
         self.counts: Counter[str] = Counter()
         self.clock_offset = ClockOffset()
@@ -57,6 +67,7 @@ class ReceiverChannels:
         self._session = session
         self._site, self._person, self._name = site, person, name
         self._clock = clock
+        self._record = record
         self._epoch = epoch
         self._reception = Reception(receiver_id, epoch)
         self.freshness = Freshness()
@@ -73,7 +84,8 @@ class ReceiverChannels:
             (channels.BULK, self._name, self._on_chunk),
         ):
             key = self._key(channel, receiver)
-            self.subscribers[channel.name] = ChannelSubscriber(self._session, channel, key, on_arrival, self._clock)
+            heard = partial(self._hear, on_arrival) if channel.recorded else on_arrival
+            self.subscribers[channel.name] = ChannelSubscriber(self._session, channel, key, heard, self._clock)
         self._session.declare_presence(self._key(channels.RECEIVER_PRESENCE, self._name))
         self._session.watch_presence(self._key(channels.SENDER_PRESENCE), lambda _, present: handlers.presence(present))
 
@@ -96,6 +108,7 @@ class ReceiverChannels:
         """Ask for the person's sizes, which are published only when they change."""
         for answer in await ask(self._session, channels.BODY, self._key(channels.BODY)):
             try:
+                self._record(self._key(channels.BODY), self._clock.now_ns(), answer)
                 self._take_body(answer)
             except WireError:
                 self.counts["body malformed"] += 1
@@ -122,6 +135,10 @@ class ReceiverChannels:
     def age_ns(self, capture_ns: int, now_ns: int) -> int | None:
         """How long ago a capture time of the sender was, by our clock; None while its offset is unknown."""
         return now_ns - self.clock_offset.to_local_ns(capture_ns, now_ns) if self.clock_offset.known else None
+
+    def _hear(self, on_arrival: Callable[[Arrival], None], arrival: Arrival) -> None:
+        self._record(arrival.key, arrival.arrival_ns, arrival.payload)
+        on_arrival(arrival)
 
     def _on_skeleton(self, arrival: Arrival) -> None:
         assert self._handlers is not None

@@ -25,6 +25,7 @@ EXAMPLES = """examples:
   telepose-receive --window                           a desktop window besides the page
   telepose-receive --headless --log-shown shown.log   no page: render offscreen and keep what was shown
   telepose-receive export person.glb person.ply       the person whom a running receiver shows now, as files
+  telepose-receive --record monday.mcap               keep what arrives, to be decoded afterwards
   telepose-receive decode monday.mcap monday.mp4      a session made by telepose-send encode, as a video (decode --help)
 """
 DECODE_EXAMPLES = """examples:
@@ -61,6 +62,9 @@ def parse_arguments(arguments: list[str] | None = None) -> argparse.Namespace:
     )
     view.add_argument(
         "--log-shown", dest="shown_log", type=Path, metavar="FILE", help="keep what was shown, for measuring"
+    )
+    view.add_argument(
+        "--record", dest="session_file", type=Path, metavar="FILE.mcap", help="keep what arrives; decode plays it"
     )
     view.add_argument("--name", dest="name", metavar="NAME", help="this receiver, in keys and logs")
     parser.add_argument("--exit-with-parent", action="store_true", default=None, help="stop when standard input ends")

@@ -76,13 +76,15 @@ class ViewSettings:
 @dataclass(frozen=True, slots=True)
 class ReceiverSettings:
     """``site`` and ``person`` name the stream to show. ``name``: this receiver, in keys and logs (None: made up anew
-    at each start). ``stats_file``: figures written at the end, as JSON; ``shown_log``: what was shown, to measure."""
+    at each start). ``stats_file``: figures written at the end, as JSON; ``shown_log``: what was shown, to measure;
+    ``session_file``: what arrives, to play it again (needs the ``recording`` extra)."""
 
     site: str = "studio"
     person: int = 0
     name: str | None = None
     stats_file: Path | None = None
     shown_log: Path | None = None
+    session_file: Path | None = None
     link: LinkSettings = field(default_factory=LinkSettings)
     repository: RepositorySettings = field(default_factory=RepositorySettings)
     view: ViewSettings = field(default_factory=ViewSettings)

@@ -24,6 +24,7 @@ from common.runtime.daemon import Daemon, DaemonError
 from common.runtime.http_access import read_token, tls_context
 from common.runtime.metrics import Health, Metrics, daemon_app, serve_app
 from common.runtime.run_statistics import RunStatistics, write_statistics
+from common.runtime.session_recording import RecordingError
 from common.runtime.stage_timer import StageTimer
 from common.runtime.steady_ticks import steadily
 from common.runtime.threads import into_background
@@ -40,6 +41,7 @@ from receiver.config import ReceiverSettings
 from receiver.jitter_buffer import JitterBuffer
 from receiver.pipeline import AnimationPath, PointPath, ReceivedPose, Shown, SkeletonToShow, mesh_of
 from receiver.rehearsal import rehearse
+from receiver.session_log import SessionLog
 from receiver.show_log import ShowLog
 from receiver.stream_state import StreamState
 from receiver.viewer.headless_screen import HeadlessScreen
@@ -109,8 +111,16 @@ class _Show:
         self._timer = StageTimer(clock)
         self._statistics = RunStatistics(self._timer)
         self._counts: Counter[str] = Counter()
+        self._session_log = _open_session_log(settings)
         self._channels = ReceiverChannels(
-            session, settings.site, settings.person, name, secrets.randbits(64), secrets.randbits(32), clock
+            session,
+            settings.site,
+            settings.person,
+            name,
+            secrets.randbits(64),
+            secrets.randbits(32),
+            clock,
+            self._session_log.add if self._session_log else lambda *_: None,
         )
         self._state = StreamState(clock)
         self._animation_path = AnimationPath(settings.repository, self._timer, clock)
@@ -172,8 +182,9 @@ class _Show:
         self._channels.close()
         for thread in (self._mesher, self._point_maker):
             thread.shutdown(wait=False, cancel_futures=True)
-        if self._log is not None:
-            self._log.close()
+        for kept in (self._log, self._session_log):
+            if kept is not None:
+                kept.close()
 
     def _on_skeleton(self, packet: SkeletonPacket, body: Skeleton, data: bytes) -> None:
         self._state.skeleton()
@@ -416,6 +427,13 @@ def _open_show_log(file: Path | None) -> ShowLog | None:
         return ShowLog(file) if file else None
     except OSError as error:
         raise DaemonError(f"shown_log {file}: {error.strerror}") from error
+
+
+def _open_session_log(settings: ReceiverSettings) -> SessionLog | None:
+    try:
+        return SessionLog(settings.session_file, settings.site, settings.person) if settings.session_file else None
+    except RecordingError as error:
+        raise DaemonError(f"session_file: {error}") from error
 
 
 def _page_address(host: str, port: int) -> str:

@@ -9,8 +9,11 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
+import cv2
 import pytest
 
+from receiver.config import ReceiverSettings
+from receiver.decode import DecodeOptions, decode
 from receiver.show_log import read_show_log
 from scripts.daemon_processes import Running, Site, free_port, site
 
@@ -28,7 +31,8 @@ def here(tmp_path: Path) -> Iterator[Site]:
 
 def test_a_person_gets_through_and_both_ends_leave_cleanly(here):
     log = here.folder / "shown.log"
-    receiver = here.receiver("--log-shown", str(log))  # first: it waits for its sender
+    session = here.folder / "session.mcap"
+    receiver = here.receiver("--log-shown", str(log), "--record", str(session))  # first: it waits for its sender
     here.rig(*SMALL_RIG)
     sender = here.sender()
     receiver.wait_for(POSES, 1)
@@ -45,6 +49,10 @@ def test_a_person_gets_through_and_both_ends_leave_cleanly(here):
     assert 'site = "studio"' in here.figures("receiver")["settings"]
     kinds = {kind for kind, _, _ in read_show_log(log)}
     assert kinds == {"skeleton", "body", "pose", "frame", "tick"}
+    said: list[str] = []
+    assert decode(ReceiverSettings(), DecodeOptions(session, here.folder / "png", rate_hz=1.0), said.append) == 0
+    last = cv2.imread(str(sorted((here.folder / "png").iterdir())[-1]))
+    assert (last < 200).any(axis=2).sum() > 8000  # a body, not bones
 
 
 def test_points_get_through_to_whoever_shows_them_and_come_back(here):
