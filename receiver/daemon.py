@@ -34,12 +34,12 @@ from common.transport.zenoh_session import ZenohSession, open_session, own_certi
 from common.wire.header import WireError
 from common.wire.receiver_report import WANTS_RESIDUALS
 from common.wire.repository_list import REPOSITORY_LIST_MAX_POSES
-from common.wire.residual_packet import needed_packets
 from common.wire.skeleton_packet import SkeletonPacket
 from receiver.channels_in import Handlers, ReceiverChannels
 from receiver.config import ReceiverSettings
 from receiver.jitter_buffer import JitterBuffer
 from receiver.pipeline import AnimationPath, PointPath, ReceivedPose, Shown, SkeletonToShow, mesh_of
+from receiver.point_maker import PointMaker
 from receiver.rehearsal import rehearse
 from receiver.session_log import SessionLog
 from receiver.show_log import ShowLog
@@ -56,7 +56,6 @@ CLOCK_PERIOD_S = 1.0
 CLOCK_QUICK_PERIOD_S = 0.1  # until the offset is known
 BODY_PERIOD_S = 0.1
 MESHES_WAITING = 8
-RESIDUALS_WAITING = 8
 
 
 class ReceiverDaemon:
@@ -127,12 +126,8 @@ class _Show:
         self._animation = ComputeWorker("animation", self._animation_path.show, self._on_shown, rehearse)
         self._mesher = ThreadPoolExecutor(1, "mesher", into_background)
         self._messages: asyncio.Queue[bytes] = asyncio.Queue(MESHES_WAITING)
-        self._point_path = PointPath(settings.person, self._timer)
-        self._point_maker = ThreadPoolExecutor(1, "points")  # of its own: a mesh takes as long as ten frames
-        self._residuals: asyncio.Queue[bytes] = asyncio.Queue(RESIDUALS_WAITING)
         self._held: tuple[int, dict[int, int]] = (-1, {})  # sender's run; bytes of the poses taken in, by id
         self._offered_poses = 0
-        self._points_made = 0
         self._appeared = asyncio.Event()
         self._meshes: deque[ReceivedPose] = deque()  # meshed, waiting for the next skeleton; bounded in _mesh_poses
         self._newest: SkeletonToShow | None = None
@@ -145,6 +140,8 @@ class _Show:
             if view.headless
             else WebViewer(allowed_hosts=view.allowed_hosts, skinning=view.skinning, mode=view.mode)
         )
+        points = PointPath(settings.person, self._timer)
+        self._points = PointMaker(points, self._channels.stream.bodies, self.viewer.show_points)
         self.metrics = self._make_metrics()
         session.add_metrics(self.metrics)
 
@@ -152,13 +149,13 @@ class _Show:
         """Receive and show until cancelled, or until the window on ``page`` is closed where there is one."""
         self._channels.open(
             Handlers(
-                self._on_skeleton, self._on_pose, self._on_body, self._on_epoch, self._on_presence, self._on_residual
+                self._on_skeleton, self._on_pose, self._on_body, self._on_epoch, self._on_presence, self._points.submit
             )
         )
         lasting: list[Coroutine[Any, Any, None]] = [
             self._animation.run(),
             self._mesh_poses(),
-            self._make_points(),
+            self._points.run(),
             steadily(REPORT_PERIOD_S, self._report),
             steadily(STATUS_PERIOD_S, self._tell_status),
             steadily(1 / self._settings.view.display_hz, self._tick, self._on_missed_ticks),
@@ -180,8 +177,8 @@ class _Show:
     def close(self) -> None:
         """Hear nothing more, and write out what is buffered."""
         self._channels.close()
-        for thread in (self._mesher, self._point_maker):
-            thread.shutdown(wait=False, cancel_futures=True)
+        self._mesher.shutdown(wait=False, cancel_futures=True)
+        self._points.close()
         for kept in (self._log, self._session_log):
             if kept is not None:
                 kept.close()
@@ -218,34 +215,6 @@ class _Show:
             self._messages.get_nowait()
             self._counts["pose waiting too long"] += 1
         self._messages.put_nowait(message)
-
-    def _on_residual(self, message: bytes) -> None:
-        """A residual packet is complete; when too many wait for decoding the oldest goes."""
-        if self._residuals.full():
-            self._residuals.get_nowait()
-            self._counts["residual waiting too long"] += 1
-        self._residuals.put_nowait(message)
-
-    async def _make_points(self) -> None:
-        """Residual packets into points; of those that wait, only what the newest needs."""
-        loop = asyncio.get_running_loop()
-        while True:
-            waiting = [await self._residuals.get()]
-            while not self._residuals.empty():
-                waiting.append(self._residuals.get_nowait())
-            needed = needed_packets(waiting)
-            self._counts["residual overtaken"] += len(waiting) - len(needed)
-            for message in needed:
-                bodies = self._channels.stream.bodies
-                try:
-                    points = await loop.run_in_executor(self._point_maker, self._point_path.take, message, bodies)
-                except WireError as error:
-                    self._counts["residual refused"] += 1
-                    log.warning("a residual packet is refused: %s", error)
-                    continue
-                if points is not None:
-                    self._points_made += 1
-                    self.viewer.show_points(points)
 
     async def _mesh_poses(self) -> None:
         """Mesh candidate poses, one after the other."""
@@ -366,7 +335,7 @@ class _Show:
         metrics.counter("skeletons_received_total", "Skeletons that were the newest", lambda: skeletons["accepted"])
         metrics.counter("skeletons_lost_total", "Gaps in the sequence", lambda: skeletons["lost"])
         metrics.counter("frames_shown_total", "Frames given to the viewer", lambda: self._state.frames_shown)
-        metrics.counter("points_shown_total", "Residual packets given to the viewer", lambda: self._points_made)
+        metrics.counter("points_shown_total", "Residual packets given to the viewer", lambda: self._points.made)
         metrics.counter("dropped_total", "What was dropped, by cause", self._dropped)
         metrics.gauge("repository_poses", "Candidate poses held", lambda: self._state.repository_poses)
         metrics.gauge("offered_poses", "Poses the sender held when it was last asked", lambda: self._offered_poses)
@@ -395,7 +364,7 @@ class _Show:
             **judged,
             **refused,
             **chunks,
-            **{f"residual {cause}": count for cause, count in self._point_path.counts.items()},
+            **{f"residual {cause}": count for cause, count in self._points.counts.items()},
             **channels.counts,
             **channels.stream.counts,
             **self._counts,

@@ -1,0 +1,89 @@
+"""Packets become points on a thread; a receiver that is behind shows the newest, and junk is counted."""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+from collections.abc import Callable
+
+from common.body.link_points import LinkPoints
+from common.runtime.clock import ManualClock
+from common.runtime.stage_timer import StageTimer
+from receiver.pipeline import PointPath
+from receiver.point_maker import WAITING, PointMaker
+from tests.posed_cloud import BODY
+from tests.test_residual_stream import encoder, sent
+
+EPOCH = 9
+
+
+class Made:
+    """A maker with what it showed; ``go_on`` lets its thread work."""
+
+    def __init__(self) -> None:
+        self.shown: list[LinkPoints] = []
+        self.go_on = threading.Event()
+        self.go_on.set()
+        path = PointPath(0, StageTimer(ManualClock()))
+        take = path.take
+
+        def when_let(*arguments: object) -> LinkPoints | None:
+            assert self.go_on.wait(10)
+            return take(*arguments)  # type: ignore[arg-type]
+
+        path.take = when_let  # type: ignore[method-assign]
+        self.maker = PointMaker(path, lambda epoch: {5: BODY} if epoch == EPOCH else {}, self.shown.append)
+
+
+async def until(condition: Callable[[], bool]) -> None:
+    async with asyncio.timeout(20):
+        while not condition():  # noqa: ASYNC110
+            await asyncio.sleep(0.005)
+
+
+async def test_each_packet_is_shown_by_one_that_keeps_up():
+    made = Made()
+    running = asyncio.create_task(made.maker.run())
+    for number, packet in enumerate(sent(encoder(), range(4))):
+        made.maker.submit(packet)
+        await until(lambda number=number: made.maker.made > number)
+    assert len(made.shown) == 4
+    assert len(made.shown[-1]) > 500
+    running.cancel()
+    made.maker.close()
+
+
+async def test_one_that_is_behind_shows_the_newest_and_junk_is_counted():
+    made = Made()
+    packets = sent(encoder(), range(6))
+    made.go_on.clear()
+    running = asyncio.create_task(made.maker.run())
+    made.maker.submit(packets[0])
+    await asyncio.sleep(0.05)  # it is at work on the key
+    for packet in packets[1:5]:
+        made.maker.submit(packet)
+    made.go_on.set()
+    await until(lambda: made.maker.made == 2)
+    assert made.maker.counts["overtaken"] == 3
+    for packet in (b"junk" * 30, packets[5][:-1], packets[5]):
+        made.maker.submit(packet)
+    await until(lambda: made.maker.made == 3)
+    assert made.maker.counts["refused"] == 2
+    for _ in range(3 * WAITING):
+        made.maker.submit(packets[1])
+    await until(lambda: made.maker.counts["late"] >= 1)
+    assert made.maker.counts["waiting too long"] == 2 * WAITING
+    assert not running.done()
+    running.cancel()
+    made.maker.close()
+
+
+async def test_packets_of_a_run_whose_body_is_unknown_give_nothing():
+    made = Made()
+    made.maker._bodies = lambda epoch: {}
+    running = asyncio.create_task(made.maker.run())
+    made.maker.submit(sent(encoder(), range(1))[0])
+    await until(lambda: made.maker.counts["without reference"] == 1)
+    assert made.shown == []
+    running.cancel()
+    made.maker.close()
