@@ -124,6 +124,10 @@ CASES: dict[str, tuple[NetworkCase, Judge]] = {
         NetworkCase(LinkConditions(10e6, 25, queue_bytes=250_000), "secure", _CUT_AND_RISE, seconds=24),
         after_changes,
     ),
+    "download/10M/secure": (
+        NetworkCase(LinkConditions(10e6, 25), "secure", seconds=24, download_s=(6, 14), congestion_control="reno"),
+        after_changes,
+    ),
     "outage/10M/secure": (_outage("secure"), outage),
     "outage/10M/tcp": (_outage("tcp"), outage),
     "deaf/10M/secure": (

@@ -8,11 +8,14 @@ import shutil
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, field
+from functools import partial
+from operator import itemgetter
 from pathlib import Path
 from typing import Any, Literal
 
+from scripts.link_emulator import ADDRESSES
 from scripts.link_model import LinkConditions
 from scripts.make_certificates import new_authority, new_certificate, write_site
 from scripts.network_emulation import EmulatedNetwork, EmulatorReport, Side, emulated_network
@@ -23,6 +26,11 @@ NS, MS = 1e9, 1e6
 PORT = 7447
 START_LIMIT_S, END_LIMIT_S = 30.0, 20.0
 IDLE_S = 4.0
+_SINK = (
+    f"import socket; s = socket.create_server(('{ADDRESSES[1]}', 5000)); print('up', flush=True); c, _ = s.accept()\n"
+    "while c.recv(65536): pass"
+)
+_SOURCE = f"import socket; s = socket.create_connection(('{ADDRESSES[1]}', 5000))\nwhile True: s.sendall(bytes(65536))"
 PROBE_PRIORITY = 10  # what is measured is the network, not who else computes on this host
 
 
@@ -38,7 +46,8 @@ class Change:
 @dataclass(frozen=True, slots=True)
 class NetworkCase:
     """A path, the kind of links across it, and what happens to it. ``settle_s``: after bulk began, until figures count;
-    ``seconds``: of bulk in all. ``bulk``: False measures skeletons alone."""
+    ``seconds``: of bulk in all. ``bulk``: False measures skeletons alone. ``download_s``: from when until when another
+    TCP connection takes all it can get."""
 
     path: LinkConditions
     kind: Kind
@@ -46,6 +55,7 @@ class NetworkCase:
     settle_s: float = 5.0
     seconds: float = 15.0
     bulk: bool = True
+    download_s: tuple[float, float] | None = None
     back: LinkConditions | None = None
     mtu: int = 1500
     congestion_control: Literal["reno", "bbr", "cubic"] | None = None
@@ -111,9 +121,12 @@ class Probes:
         self._certificates = _certificates(folder, network.addresses["A"]) if kind == "secure" else None
         self._address = f"{network.addresses['A']}:{PORT}"
         self.running: dict[str, subprocess.Popen[str]] = {}
+        self._others: list[subprocess.Popen[str]] = []
 
-    def start(self, role: Literal["sender", "receiver"], name: str = "wall") -> subprocess.Popen[str]:
-        """Start one end and wait until its session is open."""
+    def start(
+        self, role: Literal["sender", "receiver"], name: str = "wall", side: Side | None = None
+    ) -> subprocess.Popen[str]:
+        """Start one end and wait until its session is open. ``side``: a receiver's may be the sender's own."""
         site = {"sender": "studio", "receiver": "lobby"}[role]
         certificates = None if self._certificates is None else str(self._certificates / site)
         label = role if role == "sender" else name
@@ -121,7 +134,7 @@ class Probes:
         command = [sys.executable, "-m", "scripts.network_probe", json.dumps(asdict(settings))]
         if self._network.punctual and shutil.which("chrt"):
             command = ["chrt", "-f", str(PROBE_PRIORITY), *command]
-        side: Side = "A" if role == "sender" else "B"
+        side = side or ("A" if role == "sender" else "B")
         pipe = subprocess.PIPE
         process = subprocess.Popen(self._network.command(side, command), stdin=pipe, stdout=pipe, text=True)
         self.running[label] = process
@@ -148,9 +161,24 @@ class Probes:
                 raise RuntimeError(f"the {label} ended with {process.returncode}")
         return {label: json.loads((self._folder / f"{label}.json").read_text()) for label in self.running}
 
+    def download(self) -> list[subprocess.Popen[str]]:
+        """Begin a TCP transfer from A to B without end."""
+        pipe = subprocess.PIPE
+        sink = subprocess.Popen(self._network.command("B", [sys.executable, "-c", _SINK]), stdout=pipe, text=True)
+        self._others.append(sink)
+        assert sink.stdout is not None
+        sink.stdout.readline()
+        self._others.append(subprocess.Popen(self._network.command("A", [sys.executable, "-c", _SOURCE]), text=True))
+        return self._others[-2:]
+
+    def end_download(self, downloading: list[subprocess.Popen[str]]) -> None:
+        """End what ``download`` began."""
+        for process in downloading:
+            process.kill()
+
     def kill(self) -> None:
         """Whatever still runs."""
-        for process in self.running.values():
+        for process in (*self.running.values(), *self._others):
             if process.poll() is None:
                 process.kill()
                 process.wait()
@@ -195,9 +223,9 @@ def run_case(case: NetworkCase, folder: Path, idle_s: float = IDLE_S) -> Seen:
         if case.bulk:
             ends.tell("bulk on")
         changed_ns = []
-        for change in case.changes:
-            _sleep_until(began_ns + int(change.at_s * NS))
-            network.change(change.direction, **change.conditions)
+        for at_s, happen in _events(case, network, ends):
+            _sleep_until(began_ns + int(at_s * NS))
+            happen()
             changed_ns.append(time.monotonic_ns())
         _sleep_until(began_ns + int(case.seconds * NS))
         emulator, ended_ns = network.report(), time.monotonic_ns()
@@ -217,6 +245,19 @@ def run_case(case: NetworkCase, folder: Path, idle_s: float = IDLE_S) -> Seen:
         changed_ns=changed_ns,
         trace=sender["trace"],
     )
+
+
+def _events(case: NetworkCase, network: EmulatedNetwork, ends: Probes) -> list[tuple[float, Callable[[], object]]]:
+    """What happens during bulk, in order: when [s], and what to do."""
+    events: list[tuple[float, Callable[[], object]]] = [
+        (change.at_s, partial(network.change, change.direction, **change.conditions)) for change in case.changes
+    ]
+    if case.download_s is not None:
+        downloading: list[subprocess.Popen[str]] = []
+        begin_s, end_s = case.download_s
+        events.append((begin_s, lambda: downloading.extend(ends.download())))
+        events.append((end_s, lambda: ends.end_download(downloading)))
+    return sorted(events, key=itemgetter(0))
 
 
 def _sleep_until(when_ns: int) -> None:

@@ -41,9 +41,9 @@ def report(now_ns: int, number: int = 1) -> ReceiverReport:
     [
         (TEN_MEGABIT, 15, 40, 0.9),
         (path(MBIT, 50), 30, 60, 0.8),
-        (path(100 * MBIT, 20), 15, 40, 0.9),
-        (path(10 * MBIT, 200), 15, 40, 0.85),
-        (path(50 * MBIT, 200), 15, 40, 0.85),
+        (path(100 * MBIT, 20), 20, 40, 0.9),
+        (path(10 * MBIT, 200), 20, 40, 0.85),
+        (path(50 * MBIT, 200), 20, 50, 0.85),
         (path(2 * MBIT, 200), 30, 60, 0.8),
         (path(10 * MBIT, 50, queue_ms=2000), 15, 40, 0.9),
         (path(0.4 * MBIT, 50), 30, 60, 0.6),

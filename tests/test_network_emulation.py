@@ -17,7 +17,7 @@ import pytest
 from scripts.bench_network import CASES, outage, steady
 from scripts.link_model import LinkConditions
 from scripts.network_emulation import EmulatedNetwork, emulated_network, unavailable
-from scripts.network_run import NS, NetworkCase, Seen, run_case
+from scripts.network_run import NS, NetworkCase, Seen, probes, run_case
 
 WHY_NOT = unavailable()
 pytestmark = [pytest.mark.network, pytest.mark.skipif(WHY_NOT is not None, reason=WHY_NOT or "")]
@@ -104,6 +104,56 @@ def test_after_an_outage_skeletons_are_fresh_at_once_and_bulk_comes_back(kind: s
     figures = outage(case, seen)
     assert figures["resume_s"][0] <= 1.0
     assert figures["bulk_back_s"][0] <= 5.0
+
+
+@pytest.mark.network_long
+@pytest.mark.usefixtures("asked_for_long")
+def test_bulk_yields_to_a_download_and_comes_back(tmp_path: Path) -> None:
+    case, judge = CASES["download/10M/secure"]
+    figures = judge(case, not_void(run_case(case, tmp_path)))
+    assert figures["goodput_bps between"][0] >= 30_000
+    assert figures["bulk_back_s"][0] <= 5
+
+
+@pytest.mark.network_long
+@pytest.mark.usefixtures("asked_for_long")
+def test_a_receiver_on_a_bad_path_costs_another_one_nothing(tmp_path: Path) -> None:
+    with (
+        emulated_network(LinkConditions(500e3, 50, loss=0.05)) as network,
+        probes(network, "secure", tmp_path) as ends,
+    ):
+        ends.start("sender")
+        ends.start("receiver", "near", "A")
+        ends.start("receiver", "far")
+        time.sleep(1.5)
+        begin_ns = time.monotonic_ns()
+        ends.tell("bulk on")
+        time.sleep(6)
+        saw = ends.end()
+    near = sorted((shown - sent) / 1e6 for _, sent, shown in saw["near"]["shown"] if sent > begin_ns)
+    assert len(near) > 170
+    assert near[len(near) // 2] < 10
+    assert saw["near"]["bulk"][-1][1] > 20 * saw["far"]["bulk"][-1][1] > 0
+
+
+@pytest.mark.network_long
+@pytest.mark.usefixtures("asked_for_long")
+@pytest.mark.parametrize("seconds", [1, 6])
+def test_a_stopped_receiver_is_as_an_outage(seconds: float, tmp_path: Path) -> None:
+    with emulated_network(LinkConditions(10e6, 25)) as network, probes(network, "secure", tmp_path) as ends:
+        ends.start("sender")
+        receiver = ends.start("receiver")
+        ends.tell("bulk on")
+        time.sleep(4)
+        receiver.send_signal(signal.SIGSTOP)
+        time.sleep(seconds)
+        receiver.send_signal(signal.SIGCONT)
+        woken_ns = time.monotonic_ns()
+        time.sleep(6)
+        saw = ends.end()
+    fresh = [shown for _, sent, shown in saw["wall"]["shown"] if shown > woken_ns and shown - sent < 300e6]
+    assert fresh[0] - woken_ns < 2 * NS
+    assert saw["wall"]["bulk"][-1][1] > saw["wall"]["bulk"][-40][1] + 1_000_000  # two seconds
 
 
 @pytest.mark.network_long

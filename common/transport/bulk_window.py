@@ -22,6 +22,7 @@ CHUNK_HOLDS_S = 0.005  # how long one chunk may hold up a skeleton behind it on 
 PACING = 1.1  # of the window per round trip: a little more than it allows, so that pacing is not the limit
 BURST_NS = 10_000_000  # how far pacing may lag behind and catch up
 GAIN = 1.5
+CHUNK_TARGET_S = 0.012
 TRICKLE_NS = 1_000_000_000  # between two chunks
 SLOW_START_GAIN = 0.5
 LOSS_SHARE = 0.1  # of chunks lost beyond which a queue is taken to be full (GCC, draft-ietf-rmcat-gcc-02 §6)
@@ -32,7 +33,7 @@ class WindowSettings:
     """``target_ms``: queueing delay to stay at [ms]. ``floor_bps``: what bulk may use whatever the delay [bit/s].
     ``max_window_bytes``: most bytes in flight. ``report_period_ms``: how often the receiver reports [ms]."""
 
-    target_ms: float = 6.0
+    target_ms: float = 7.0
     floor_bps: int = 100_000
     max_window_bytes: int = 4 << 20
     report_period_ms: float = 50.0
@@ -277,7 +278,7 @@ class BulkWindow:
         """The new window after ``acked`` bytes arrived while it was the window that limited them."""
         q = self._path.queueing_s
         chunk_s = self.chunk_bytes / self.rate_bytes_s
-        target = max(self._target_s, min(chunk_s, 2 * self._target_s))  # on a slow link one chunk alone takes so long
+        target = max(self._target_s, min(chunk_s, CHUNK_TARGET_S))  # on a slow link one chunk alone takes so long
         round_trip_s = self._path.least_round_trip_s + self._period_s
         heeded = now_ns < self._reduced_ns + int(round_trip_s / NS)  # the queue that the last cut will drain
         if self._slow_start:
@@ -293,7 +294,7 @@ class BulkWindow:
             self._window += max(-acked / 4, step)
         if q < target / 2 and self._rates:
             # Where the path delivered more a moment ago, the queue was a hiccup: TCP's own, say (BBR's every 10 s).
-            self._window = max(self._window, 0.8 * max(list(self._rates)[-8:]) * round_trip_s)
+            self._window = max(self._window, 0.9 * max(list(self._rates)[-8:]) * round_trip_s)
         if q > 3 * target and not heeded and not (self._slow_start and self._rates):
             self._reduced_ns = now_ns
             self._slow_start = False
