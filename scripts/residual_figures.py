@@ -11,7 +11,7 @@ import json
 import os
 import tempfile
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import cv2
@@ -76,7 +76,14 @@ def rate_chart(case: str, rows: Sequence[Row]) -> str:
         if size <= RATE_UP_TO_BYTES:
             lines[name.split("/")[3]].append((size / 1000, db[name]))
     drawn = {method: ([x for x, _ in sorted(at)], [y for _, y in sorted(at)]) for method, at in lines.items()}
-    return line_chart(f"{case}: likeness over size", "kB a frame", "dB", drawn, dots=True, low=16.0)
+    return line_chart(
+        f"{case}: likeness over size",
+        "kB a frame",
+        "dB",
+        drawn,
+        dots=True,
+        low=_whole_tens(y for _, ys in drawn.values() for y in ys),
+    )
 
 
 def residual_clouds(sequence: PosedSequence, level: float) -> tuple[list[PointCloud], float]:
@@ -101,7 +108,14 @@ def frames_chart(case: str, sequence: PosedSequence, shown: dict[float, list[Poi
         f"{level:g} %": ([k / FRAME_RATE_HZ for k in ks], [sequence.likeness(k, clouds[k]).psnr_db for k in ks])
         for level, clouds in sorted(shown.items(), reverse=True)
     }
-    return line_chart(f"{case}: likeness of each frame", "s", "dB", lines, low=16.0)
+    return line_chart(
+        f"{case}: likeness of each frame", "s", "dB", lines, low=_whole_tens(y for _, ys in lines.values() for y in ys)
+    )
+
+
+def _whole_tens(values: Iterable[float]) -> float:
+    """What a chart of them begins at."""
+    return float(10 * np.floor(min(values) / 10))
 
 
 def strip_of(sequence: PosedSequence, shown: dict[float, tuple[list[PointCloud], float]]) -> np.ndarray:

@@ -42,7 +42,7 @@ VIDEO_CODERS = {
     "h265": H265_LIVE,
     "h265-slow": VideoCoder("libx265", "hevc", "slow", live=False),
 }
-_FINE_FROM_BPS = 2e6  # below, video is coded at half its resolution: better at such rates
+_FINE_FROM_BPS = 4e6  # below, video is coded at half its resolution: better at such rates
 
 
 def yang_frame(rung: Rung, sequence: PosedSequence, k: int) -> CodedFrame:
