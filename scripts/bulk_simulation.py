@@ -175,7 +175,7 @@ class BulkSimulation:
     def _report_arrives(self, packet: object) -> None:
         assert isinstance(packet, ReceiverReport)
         self.sender.on_report(packet)
-        self.pace.on_report("", packet, self.window.queueing_delay_s, self.window.at_floor, self.loop.now_ns())
+        self.pace.on_report("", packet, self.window.skeleton_queueing_s, self.window.at_floor, self.loop.now_ns())
         self.window.trickle = self.pace.divisor > 1
         if self.divisors[-1][1] != self.pace.divisor:
             self.divisors.append((self.loop.now_ns(), self.pace.divisor))

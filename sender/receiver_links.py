@@ -160,10 +160,10 @@ class ReceiverLinks:
         """Fewer skeletons, and next to no bulk, where the path cannot even carry the skeletons; and back."""
         pace, before = self.skeleton_pace, self.skeleton_pace.divisor
         window = link.bulk.window
-        pace.on_report(link.name, report, window.queueing_delay_s, window.at_floor, link.heard_ns)
+        pace.on_report(link.name, report, window.skeleton_queueing_s, window.at_floor, link.heard_ns)
         window.trickle = pace.divisor_of(link.name) > 1
         if pace.divisor != before:
-            q_ms = window.queueing_delay_s * 1e3
+            q_ms = window.skeleton_queueing_s * 1e3
             log.warning("1 of %d skeletons is sent: receiver %s, %.0f ms of queue", pace.divisor, link.name, q_ms)
 
     def on_repository(self, question: Question) -> bytes:

@@ -117,7 +117,7 @@ def test_bulk_yields_to_a_download_and_comes_back(tmp_path: Path) -> None:
 
 @pytest.mark.network_long
 @pytest.mark.usefixtures("asked_for_long")
-def test_a_receiver_on_a_bad_path_costs_another_one_nothing(tmp_path: Path) -> None:
+def test_a_receiver_on_a_bad_path_costs_another_one_neither_bulk_nor_delay(tmp_path: Path) -> None:
     with (
         emulated_network(LinkConditions(500e3, 50, loss=0.05)) as network,
         probes(network, "secure", tmp_path) as ends,
@@ -131,7 +131,7 @@ def test_a_receiver_on_a_bad_path_costs_another_one_nothing(tmp_path: Path) -> N
         time.sleep(6)
         saw = ends.end()
     near = sorted((shown - sent) / 1e6 for _, sent, shown in saw["near"]["shown"] if sent > begin_ns)
-    assert len(near) > 170
+    assert len(near) > 80  # of 180: where the bad path cannot carry all, every second goes to both, on purpose
     assert near[len(near) // 2] < 10
     assert saw["near"]["bulk"][-1][1] > 20 * saw["far"]["bulk"][-1][1] > 0
 

@@ -112,6 +112,11 @@ class BulkWindow:
         return self._path.queueing_s
 
     @property
+    def skeleton_queueing_s(self) -> float:
+        """How long skeletons wait in queues on the way, at the last report that said so."""
+        return self._path.skeleton_queueing_s
+
+    @property
     def rate_bytes_s(self) -> float:
         """R̂: what the path delivers [bytes/s]; before the first sample 16 KB per round trip."""
         if not self._rates:

@@ -39,6 +39,7 @@ class PathDelay:
     def __init__(self) -> None:
         self.round_trip_s = 0.2  # until the first sample
         self.queueing_s = 0.0
+        self.skeleton_queueing_s = 0.0  # without what only chunks wait for
         self._round_trips_ns = _LeastOfLate()
         self._delays_ns = _LeastOfLate()
 
@@ -67,6 +68,8 @@ class PathDelay:
         assert base_ns is not None
         # Skeletons are few: what all the chunks of the same period escaped was jitter and no queue.
         seen_s = (min(delays_ns) - base_ns) * NS if d_s is not None else 0.0
+        if d_s is not None:
+            self.skeleton_queueing_s = seen_s
         # Chunks may queue where skeletons do not, above a second link say: without this the window would not see it.
         own_s = ((d_b - base_ns) * NS - chunk_s) * BULK_SHARE if d_b is not None else 0.0
         self.queueing_s = max(seen_s, own_s, 0.0)
