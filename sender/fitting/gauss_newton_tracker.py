@@ -52,7 +52,7 @@ class GaussNewtonSettings:
 
 
 HYPOTHESES = (1.0, 0.5, 0.0)  # shares of the last velocity
-GUESS = Schedule(1, 0.20, 0.10, 0.2, 1.0, 1.0, 0.025)
+GUESS = Schedule(1, 0.20, 0.10, 0.2, 1.0, 1.0)
 COARSE = Schedule(2, 0.15, 0.08, 0.1, 1.0, 1.0, 0.025)
 FINE = Schedule(2, 0.08, 0.06, 0.1, 1.0, 1.0, 0.025)
 GUESS_POINTS, COARSE_POINTS, FINE_POINTS = 250, 600, 2500
