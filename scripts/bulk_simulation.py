@@ -169,8 +169,12 @@ class BulkSimulation:
                 return
             self._reception.chunk(chunk, len(packet), now_ns + CLOCK_SKEW_NS)
             if message is not None:
-                self.messages += 1
-                self.wrong += message != self._payload
+                self._on_message(message, now_ns)
+
+    def _on_message(self, message: bytes, now_ns: int) -> None:
+        """A message is complete."""
+        self.messages += 1
+        self.wrong += message != self._payload
 
     def _report_arrives(self, packet: object) -> None:
         assert isinstance(packet, ReceiverReport)

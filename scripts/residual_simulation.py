@@ -12,8 +12,7 @@ from collections.abc import Hashable
 from dataclasses import dataclass
 
 from common.transport.bulk_sender import PERIOD_NS, BulkMessage, BulkSender
-from common.transport.chunks import ChunkError, decode_chunk
-from scripts.bulk_simulation import CLOCK_SKEW_NS, EPOCH, BulkSimulation, S
+from scripts.bulk_simulation import EPOCH, BulkSimulation, S
 from scripts.link_model import LinkConditions
 from sender.candidate_poses.mesh_scheduler import MeshScheduler
 from sender.candidate_poses.usable_pose_set import Quotients
@@ -107,22 +106,10 @@ class ResidualSimulation(BulkSimulation):
     def _on_delivered(self, name: Hashable) -> None:
         self.delivered.append(name)
 
-    def _arrives(self, packet: object) -> None:
-        if not isinstance(packet, bytes):
-            super()._arrives(packet)
-            return
-        now_ns = self.loop.now_ns()
-        self.arrived.append((now_ns, len(packet)))
-        chunk = decode_chunk(packet)
-        try:
-            message = self._assembler.push(chunk)
-        except ChunkError:
-            self.wrong += 1
-            return
-        self._reception.chunk(chunk, len(packet), now_ns + CLOCK_SKEW_NS)
-        if message is not None and len(message) == POSE_BYTES:
+    def _on_message(self, message: bytes, now_ns: int) -> None:
+        if len(message) == POSE_BYTES:
             self.pose_bytes += len(message)
-        elif message is not None:
+        else:
             sequence, key, made_ns = _STAMP.unpack_from(message)
             self.residuals.append(Arrived(sequence, key, made_ns, now_ns))
 

@@ -37,6 +37,8 @@ def handshake(server: Path, client: Path | None, name: str, ca: Path | None = No
                 end.do_handshake()
     with contextlib.suppress(ssl.SSLWantReadError):
         ends[0].read(1)  # TLS 1.3: a refused client hears of it only now
+    for end in ends:
+        end.do_handshake()  # raises when either still waits for the other
 
 
 @pytest.fixture
