@@ -6,6 +6,7 @@ is made of it.
 
 from __future__ import annotations
 
+import logging
 from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -22,6 +23,7 @@ from common.transport.chunks import decode_chunk
 from common.transport.clock_exchange import exchange_times
 from common.transport.clock_offset import ClockOffset
 from common.transport.reception import Reception
+from common.transport.temporal_layers import LAYERS
 from common.transport.zenoh_session import ZenohSession
 from common.wire.header import WireError
 from common.wire.receiver_report import encode_report
@@ -30,6 +32,9 @@ from common.wire.residual_packet import is_residual
 from common.wire.skeleton_packet import SkeletonPacket
 from receiver.freshness import Freshness
 from receiver.incoming_stream import IncomingStream
+from receiver.layer_subscription import LayerSubscription
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,6 +75,7 @@ class ReceiverChannels:
         self._record = record
         self._epoch = epoch
         self._reception = Reception(receiver_id, epoch)
+        self._layers = LayerSubscription()
         self.freshness = Freshness()
         self.first_skeleton_ns: int | None = None  # when the very first one arrived
         self._report = ChannelPublisher(session, channels.REPORT, self._key(channels.REPORT, name))
@@ -78,14 +84,11 @@ class ReceiverChannels:
     def open(self, handlers: Handlers) -> None:
         """Listen, and be seen."""
         self._handlers = handlers
-        for channel, receiver, on_arrival in (
-            (channels.SKELETON, None, self._on_skeleton),
-            (channels.BODY, None, self._on_body),
-            (channels.BULK, self._name, self._on_chunk),
-        ):
-            key = self._key(channel, receiver)
-            heard = partial(self._hear, on_arrival) if channel.recorded else on_arrival
-            self.subscribers[channel.name] = ChannelSubscriber(self._session, channel, key, heard, self._clock)
+        self._listen(channels.SKELETON, self._key(channels.SKELETON, layer=0), self._on_skeleton)
+        for layer in range(1, LAYERS):
+            self.subscribers["skeleton"].add(self._key(channels.SKELETON, layer=layer))
+        self._listen(channels.BODY, self._key(channels.BODY), self._on_body)
+        self._listen(channels.BULK, self._key(channels.BULK, self._name), self._on_chunk)
         self._session.declare_presence(self._key(channels.RECEIVER_PRESENCE, self._name))
         self._session.watch_presence(self._key(channels.SENDER_PRESENCE), lambda _, present: handlers.presence(present))
 
@@ -95,10 +98,31 @@ class ReceiverChannels:
             subscriber.close()
 
     def send_report(self, repository_poses: int, wants: int = 0) -> None:
-        """Tell the sender's bulk window how things are, and what this receiver has a use for."""
+        """Tell the sender's bulk window how things are, and what this receiver has a use for; time also to take more
+        skeletons, or fewer."""
         now_ns = self._clock.now_ns()
-        report = self._reception.report(now_ns, self.stream.body_revision, repository_poses, wants)
+        self._judge_layers(now_ns)
+        revision = self.stream.body_revision
+        report = self._reception.report(now_ns, revision, repository_poses, wants, self._layers.carried_divisor)
         self._report.put(encode_report(report))
+
+    @property
+    def skeleton_divisor(self) -> int:
+        """1 in so many skeletons is taken, since the path carries no more."""
+        return self._layers.divisor
+
+    def _judge_layers(self, now_ns: int) -> None:
+        before = self._layers.layers
+        if not self._layers.judge(self.stream.skeletons.counts["lost"], now_ns):
+            return
+        after, skeletons = self._layers.layers, self.subscribers["skeleton"]
+        for layer in range(before, after):
+            skeletons.add(self._key(channels.SKELETON, layer=layer))
+        for layer in range(after, before):
+            skeletons.remove(self._key(channels.SKELETON, layer=layer))
+        self.stream.skeletons.take(after)
+        why = "carries no more" if after < before else "has room"
+        log.warning("1 in %d skeletons is taken: the path %s", self.skeleton_divisor, why)
 
     async def ask_time(self) -> None:
         """One exchange of times with the sender."""
@@ -136,6 +160,10 @@ class ReceiverChannels:
         """How long ago a capture time of the sender was, by our clock; None while its offset is unknown."""
         return now_ns - self.clock_offset.to_local_ns(capture_ns, now_ns) if self.clock_offset.known else None
 
+    def _listen(self, channel: Channel, key: str, on_arrival: Callable[[Arrival], None]) -> None:
+        heard = partial(self._hear, on_arrival) if channel.recorded else on_arrival
+        self.subscribers[channel.name] = ChannelSubscriber(self._session, channel, key, heard, self._clock)
+
     def _hear(self, on_arrival: Callable[[Arrival], None], arrival: Arrival) -> None:
         self._record(arrival.key, arrival.arrival_ns, arrival.payload)
         on_arrival(arrival)
@@ -152,6 +180,7 @@ class ReceiverChannels:
             self.first_skeleton_ns = arrival.arrival_ns
         packet = newest.packet
         self._reception.skeleton(packet.epoch, packet.send_ns, arrival.arrival_ns)
+        self._layers.skeleton(packet.epoch, packet.send_ns, arrival.arrival_ns)
         if newest.body is not None and self.freshness.is_fresh(packet.epoch, packet.send_ns, arrival.arrival_ns):
             self._handlers.skeleton(packet, newest.body, arrival.payload)
 
@@ -168,8 +197,9 @@ class ReceiverChannels:
         chunk = decode_chunk(arrival.payload)
         message = self.stream.chunk(chunk)
         self._reception.chunk(chunk, len(arrival.payload), arrival.arrival_ns)
+        self._layers.bulk(len(arrival.payload))
         if message is not None:
             (self._handlers.residual if is_residual(message) else self._handlers.pose)(message)
 
-    def _key(self, channel: Channel, receiver: str | None = None) -> str:
-        return channel_key(channel, self._site, self._person, receiver)
+    def _key(self, channel: Channel, receiver: str | None = None, layer: int | None = None) -> str:
+        return channel_key(channel, self._site, self._person, receiver, layer)

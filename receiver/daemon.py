@@ -308,6 +308,7 @@ class _Show:
             skeleton_bytes=subscribers["skeleton"].arrived_bytes,
             bulk_bytes=subscribers["bulk"].arrived_bytes,
             foreign_skeletons=self._channels.stream.skeletons.counts["old_epoch"],
+            skeleton_divisor=self._channels.skeleton_divisor,
         )
         self._health.ready, self._health.reason = self._state.receiving, status.connection.value
         self.viewer.set_status(status)
@@ -334,6 +335,8 @@ class _Show:
         skeletons = self._channels.stream.skeletons.counts
         metrics.counter("skeletons_received_total", "Skeletons that were the newest", lambda: skeletons["accepted"])
         metrics.counter("skeletons_lost_total", "Gaps in the sequence", lambda: skeletons["lost"])
+        about = "1 in so many skeletons is taken, since the path carries no more"
+        metrics.gauge("skeleton_divisor", about, lambda: self._channels.skeleton_divisor)
         metrics.counter("frames_shown_total", "Frames given to the viewer", lambda: self._state.frames_shown)
         metrics.counter("points_shown_total", "Residual packets given to the viewer", lambda: self._points.made)
         metrics.counter("dropped_total", "What was dropped, by cause", self._dropped)

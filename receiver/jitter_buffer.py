@@ -3,7 +3,8 @@
 A frame captured at c is shown at c + base + D. ``base`` is the quickest transit seen lately, clock offset included, so
 that no common zero is needed; D is ``smoothness`` times the delay at which 99 % of the frames have come in time to be
 interpolated to (an adaptive playout delay; Moon, Kurose & Towsley 1998). What D does not cover is extrapolated, within
-a bound, and then held. A single lost frame is there all the same: the packet after it repeats it.
+a bound, and then held. A single lost frame is there all the same, since the packet after it repeats it; so is every
+second frame where only half of the skeletons are taken.
 Pure: time is an argument. With a smoothness of 0 there is no need of it: the newest skeleton is shown when it comes.
 """
 
@@ -39,7 +40,7 @@ class Frame:
 
 class JitterBuffer:
     """Frames of one sender's run in, poses at any time out. ``counts``: interpolated, extrapolated, held (as often as
-    it was asked), filled (single lost frames that the next packet repeated), jumps."""
+    it was asked), filled (frames that did not come and that the next packet repeated), jumps."""
 
     def __init__(self, smoothness: float) -> None:
         """
@@ -109,9 +110,9 @@ class JitterBuffer:
         self._transits.append((bucket, transit_ns))
 
     def _fill(self, before: SkeletonPacket, packet: SkeletonPacket, body: Skeleton) -> None:
-        """Put the one lost frame in between where the packet repeats it."""
+        """Put the frame in between that the packet repeats: it was lost, or of a layer that is not taken."""
         capture_ns = packet.capture_ns - packet.previous_age_ns
-        if packet.previous is None or packet.sequence != before.sequence + 2 or capture_ns <= before.capture_ns:
+        if packet.previous is None or packet.sequence < before.sequence + 2 or capture_ns <= before.capture_ns:
             return
         lost = replace(packet, sequence=packet.sequence - 1, capture_ns=capture_ns, pose=packet.previous, previous=None)
         self._frames.append(Frame(lost, body))

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections import Counter, deque
 
+from common.transport.temporal_layers import LAYERS, between, layer_of
 from common.wire.skeleton_packet import SkeletonPacket
 
 RETIRED_EPOCHS = 16
@@ -17,7 +18,8 @@ FUTURE_RUN = 10  # so many packets from the future, each fit to follow the one b
 
 
 class SkeletonBuffer:
-    """Judges each arriving packet. ``counts``: accepted, duplicate, stale, old_epoch, far_future, lost, epochs."""
+    """Judges each arriving packet. ``counts``: accepted, duplicate, stale, old_epoch, far_future, lost (of the layers
+    taken), epochs."""
 
     def __init__(self) -> None:
         self.newest: SkeletonPacket | None = None
@@ -27,6 +29,13 @@ class SkeletonBuffer:
         self._ahead_ns = 0
         self._ahead_run = 0
         self._retired: deque[int] = deque(maxlen=RETIRED_EPOCHS)
+        self._taken = self._coming = LAYERS
+
+    def take(self, layers: int) -> None:
+        """The lowest ``layers`` are taken from now on. What others have is not lost; of a layer that is new, nothing is
+        before its first packet came."""
+        self._taken = layers
+        self._coming = min(self._coming, layers)
 
     def push(self, packet: SkeletonPacket, now_ns: int) -> bool:
         """Take a packet that arrived at ``now_ns`` (receiver's monotonic clock); True when it is the one to show."""
@@ -41,7 +50,8 @@ class SkeletonBuffer:
             if self.newest is not None:
                 self._retired.append(self.newest.epoch)
         else:
-            self.counts["lost"] += packet.sequence - self.newest.sequence - 1
+            self.counts["lost"] += between(self.newest.sequence, packet.sequence, self._coming)
+        self._coming = max(self._coming, min(layer_of(packet.sequence) + 1, self._taken))
         self.newest, self._arrival_ns = packet, now_ns
         self._ahead, self._ahead_run = None, 0
         return True

@@ -55,10 +55,16 @@ class StreamState:
         return self._skeleton_ns is not None and self._clock.now_ns() - self._skeleton_ns < LOST_AFTER_NS
 
     def status(
-        self, age_ms: float | None, skeleton_bytes: int, bulk_bytes: int, foreign_skeletons: int = 0
+        self,
+        age_ms: float | None,
+        skeleton_bytes: int,
+        bulk_bytes: int,
+        foreign_skeletons: int = 0,
+        skeleton_divisor: int = 1,
     ) -> ViewerStatus:
         """The figures now. ``skeleton_bytes``, ``bulk_bytes`` and ``foreign_skeletons``, which are of a run of the
-        sender that is over for us: arrived in all so far. Rates cover two seconds."""
+        sender that is over for us: arrived in all so far; 1 in ``skeleton_divisor`` skeletons is taken. Rates cover two
+        seconds."""
         now_ns = self._clock.now_ns()
         self._history.append((now_ns, self._skeletons, skeleton_bytes, bulk_bytes, foreign_skeletons))
         while now_ns - self._history[0][0] > RATE_SPAN_NS:
@@ -66,7 +72,7 @@ class StreamState:
         then_ns, skeletons, then_skeleton_bytes, then_bulk_bytes, then_foreign = self._history[0]
         self._note_rival(foreign_skeletons - then_foreign)
         span_s = max((now_ns - then_ns) / 1e9, 1e-3)
-        connection, detail = self._connection()
+        connection, detail = self._connection(skeleton_divisor)
         frame = self.frame
         has_pose = frame is not None and frame.pose_id is not None
         return ViewerStatus(
@@ -95,9 +101,11 @@ class StreamState:
         if self._rival and not rival:
             log.warning("two senders use this site's and person's name: the one that came last is shown")
 
-    def _connection(self) -> tuple[ConnectionState, str]:
+    def _connection(self, skeleton_divisor: int) -> tuple[ConnectionState, str]:
         if self.receiving and self._rival:
             return ConnectionState.RECEIVING, "two senders use this name, and the one that came last is shown"
+        if self.receiving and skeleton_divisor > 1:
+            return ConnectionState.RECEIVING, f"1 in {skeleton_divisor} skeletons, since the path carries no more"
         if self.receiving:
             waiting = self.frame is None or self.frame.pose_id is None
             return ConnectionState.RECEIVING, "skeleton only, the first mesh is on its way" if waiting else ""

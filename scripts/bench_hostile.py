@@ -21,6 +21,7 @@ import zenoh
 
 from common.transport import channels
 from common.transport.channels import Channel, channel_key
+from common.transport.temporal_layers import LAYERS
 from scripts.daemon_processes import Running, Site, free_port, site
 from scripts.hostile_peer import (
     closed,
@@ -106,7 +107,8 @@ class Victim:
         begin_s = time.monotonic()
         with closed(outsider(pair(self.port), self.sites / "wall", patient=True)) as session:
             came = threading.Event()
-            subscriber = session.declare_subscriber(channel_key(channels.SKELETON, "studio", 0), lambda _: came.set())
+            skeletons = channel_key(channels.SKELETON, "studio", 0, layer=channels.ANY)
+            subscriber = session.declare_subscriber(skeletons, lambda _: came.set())
             assert came.wait(60), "nothing came for a minute"
             subscriber.undeclare()  # type: ignore[no-untyped-call]
             return time.monotonic() - begin_s
@@ -144,7 +146,8 @@ class Victim:
     def _key(self, chance: random.Random) -> tuple[str, Channel]:
         channel = chance.choice(channels.CHANNELS)
         name = chance.choice(["wall.1", "wall.2", "lobby.1"]) if channel.per_receiver else None
-        return channel_key(channel, "studio", 0, name), channel
+        layer = chance.randrange(LAYERS) if channel.layered else None
+        return channel_key(channel, "studio", 0, name, layer), channel
 
     def _forge(self, session: zenoh.Session, chance: random.Random) -> None:
         """Reports with impossible contents, as fast as they go, of ever more receivers."""

@@ -43,6 +43,8 @@ def steady(case: NetworkCase, seen: Seen) -> Figures:
         "skeleton_delay_over_idle_p50_ms": (percentile(delays, 50) - idle_ms, "ms"),
         "skeleton_delay_over_idle_p99_ms": (percentile(delays, 99) - idle_ms, "ms"),
         "skeleton_lost_share": (seen.lost_share(begin_ns, end_ns), ""),
+        "frames_unseen_share": (seen.unseen_share(begin_ns, end_ns), ""),
+        "skeleton_divisor": (seen.divisor_at(end_ns), ""),
         "skeletons_shown_per_s": (len(delays) / (end_ns - begin_ns) * NS, "1/s"),
         "oldest_shown_ms": (delays[-1] if delays else float("nan"), "ms"),
     }

@@ -9,18 +9,21 @@ from __future__ import annotations
 import asyncio
 import random
 from collections.abc import Callable, Hashable
-from dataclasses import dataclass
 from itertools import count
 
+from common.body.skeleton_pose import rest_pose
 from common.transport.bulk_sender import BulkMessage, BulkSender
 from common.transport.bulk_window import BulkWindow, WindowSettings
 from common.transport.chunks import ChunkAssembler, ChunkError, decode_chunk
 from common.transport.reception import Reception
+from common.transport.temporal_layers import layer_of
 from common.wire.receiver_report import ReceiverReport
+from common.wire.skeleton_packet import SkeletonPacket
 from receiver.freshness import Freshness
+from receiver.layer_subscription import LayerSubscription
+from receiver.skeleton_buffer import SkeletonBuffer
 from scripts.link_model import Link, LinkConditions
 from scripts.virtual_time import VirtualTimeLoop, run_virtually
-from sender.skeleton_pace import SkeletonPace
 
 MS, S = 1_000_000, 1_000_000_000
 EPOCH = 7
@@ -29,6 +32,7 @@ SKELETON_BYTES = 320  # on the wire, with the headers of TCP (transport.md §1)
 REPORT_BYTES = 170
 PACKET_BYTES, HEADER_BYTES = 1400, 60  # how much of a chunk fits into a packet, and what it costs
 MESSAGE_BYTES = 200_000
+POSE = rest_pose()
 Deliver = Callable[[object], None]
 
 
@@ -66,16 +70,11 @@ class Lane:
         self._arm()
 
 
-@dataclass(frozen=True, slots=True)
-class _Skeleton:
-    sent_ns: int
-
-
 class BulkSimulation:
     """One sender and one receiver. ``there``, ``back``: the path's two directions.
 
     What happened: ``skeletons`` (when sent, how long under way) [ns], of them ``fresh`` those worth showing,
-    ``divisors`` of their pace (from when, which), ``sent`` and ``arrived`` chunks (when, bytes), ``messages``: whole
+    ``divisors`` (from when, 1 in how many is taken), ``sent`` and ``arrived`` chunks (when, bytes), ``messages``: whole
     ones, ``wrong``: of them those that are not what was sent.
     """
 
@@ -92,7 +91,6 @@ class BulkSimulation:
         self.back = Lane(self.loop, back or there, 2, self._report_arrives)
         self.window = BulkWindow(EPOCH, settings)
         self.sender = BulkSender(self, self.window, EPOCH, self._next_message, self._on_delivered, self.loop)
-        self.pace = SkeletonPace()
         self.receiver_epoch = 1
         self.bulk = True
         self.skeletons: list[tuple[int, int]] = []
@@ -113,6 +111,9 @@ class BulkSimulation:
         self._reception = Reception(1, self.receiver_epoch)
         self._assembler = ChunkAssembler()
         self._freshness = Freshness()
+        self.layers = LayerSubscription()
+        self._flowing = self.layers.layers  # at the sender
+        self._buffer = SkeletonBuffer()
 
     def at(self, seconds: float, action: Callable[[], object]) -> None:
         """Do something at a time of the run."""
@@ -128,18 +129,30 @@ class BulkSimulation:
         await asyncio.wait(tasks, timeout=seconds, return_when=asyncio.FIRST_EXCEPTION)
 
     async def _send_skeletons(self) -> None:
-        while self._skeleton_hz:
-            if self.pace.due(self.loop.now_ns()):
-                self.there.put(_Skeleton(self.loop.now_ns()), SKELETON_BYTES)
+        for sequence in count():
+            if not self._skeleton_hz:
+                break
+            if layer_of(sequence) < self._flowing:
+                packet = SkeletonPacket(0, EPOCH, sequence, self.loop.now_ns(), 0, 1.0, POSE)
+                self.there.put(packet, SKELETON_BYTES)
             await asyncio.sleep(1 / self._skeleton_hz)
         await asyncio.Event().wait()
 
     async def _report(self) -> None:
         await asyncio.sleep(0.01)
         while True:
-            report = self._reception.report(self.loop.now_ns() + CLOCK_SKEW_NS, None, 0)
+            now_ns = self.loop.now_ns()
+            if self.layers.judge(self._buffer.counts["lost"], now_ns + CLOCK_SKEW_NS):
+                self.divisors.append((now_ns, self.layers.divisor))
+                self._buffer.take(self.layers.layers)
+                told_ns = now_ns + int(self.back.link.conditions.delay_ms * MS)  # Zenoh's declarations are not lost
+                self.loop.at(told_ns, self._subscribe, self.layers.layers)
+            report = self._reception.report(now_ns + CLOCK_SKEW_NS, None, 0, 0, self.layers.carried_divisor)
             self.back.put(report, REPORT_BYTES)
             await asyncio.sleep(self._report_s)
+
+    def _subscribe(self, layers: int) -> None:
+        self._flowing = layers
 
     def put(self, payload: bytes) -> None:
         """The bulk sender's publisher."""
@@ -154,11 +167,9 @@ class BulkSimulation:
 
     def _arrives(self, packet: object) -> None:
         now_ns = self.loop.now_ns()
-        if isinstance(packet, _Skeleton):
-            self.skeletons.append((packet.sent_ns, now_ns - packet.sent_ns))
-            if self._freshness.is_fresh(EPOCH, packet.sent_ns, now_ns + CLOCK_SKEW_NS):
-                self.fresh.append(self.skeletons[-1])
-            self._reception.skeleton(EPOCH, packet.sent_ns, now_ns + CLOCK_SKEW_NS)
+        if isinstance(packet, SkeletonPacket):
+            if layer_of(packet.sequence) < self.layers.layers:
+                self._skeleton_arrives(packet, now_ns)
         elif isinstance(packet, bytes):
             self.arrived.append((now_ns, len(packet)))
             chunk = decode_chunk(packet)
@@ -168,8 +179,19 @@ class BulkSimulation:
                 self.wrong += 1
                 return
             self._reception.chunk(chunk, len(packet), now_ns + CLOCK_SKEW_NS)
+            self.layers.bulk(len(packet))
             if message is not None:
                 self._on_message(message, now_ns)
+
+    def _skeleton_arrives(self, packet: SkeletonPacket, now_ns: int) -> None:
+        arrival_ns = now_ns + CLOCK_SKEW_NS
+        if not self._buffer.push(packet, arrival_ns):
+            return
+        self.skeletons.append((packet.send_ns, now_ns - packet.send_ns))
+        if self._freshness.is_fresh(EPOCH, packet.send_ns, arrival_ns):
+            self.fresh.append(self.skeletons[-1])
+        self._reception.skeleton(EPOCH, packet.send_ns, arrival_ns)
+        self.layers.skeleton(EPOCH, packet.send_ns, arrival_ns)
 
     def _on_message(self, message: bytes, now_ns: int) -> None:
         """A message is complete."""
@@ -178,11 +200,8 @@ class BulkSimulation:
 
     def _report_arrives(self, packet: object) -> None:
         assert isinstance(packet, ReceiverReport)
+        self.window.trickle = packet.skeleton_divisor > 1
         self.sender.on_report(packet)
-        self.pace.on_report("", packet, self.window.skeleton_queueing_s, self.window.at_floor, self.loop.now_ns())
-        self.window.trickle = self.pace.divisor > 1
-        if self.divisors[-1][1] != self.pace.divisor:
-            self.divisors.append((self.loop.now_ns(), self.pace.divisor))
 
     def goodput_bps(self, begin_s: float, end_s: float) -> float:
         """Bytes of chunks that arrived, per second."""

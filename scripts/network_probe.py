@@ -88,7 +88,7 @@ async def send(settings: ProbeSettings) -> dict[str, Any]:
     """The sender's end; what it sent, as JSON."""
     epoch, meshes = secrets.randbits(32), EndlessMeshes()
     sent: list[tuple[int, int]] = []  # sequence number, when [ns]
-    # When, window and in flight [bytes], q [ms], rate [bit/s], divisor of skeletons.
+    # When, window and in flight [bytes], q [ms], rate [bit/s], the divisor of skeletons reported.
     trace: list[tuple[int, int, int, float, float, int]] = []
     allowed = for_sender(SITE, ("lobby",))
     async with open_session(settings.link(), allowed if settings.certificates else ()) as session:
@@ -101,10 +101,9 @@ async def send(settings: ProbeSettings) -> dict[str, Any]:
             due_s, pose, sequence = asyncio.get_running_loop().time(), rest_pose(), 0
             while True:
                 now_ns = CLOCK.now_ns()
-                if links.skeleton_pace.due(now_ns):
-                    packet = SkeletonPacket(0, epoch, sequence, now_ns, 1, 1.0, pose, send_delay_ns=0)
-                    channels.publish_skeleton(encode_skeleton(packet))
-                    sent.append((sequence, now_ns))
+                packet = SkeletonPacket(0, epoch, sequence, now_ns, 1, 1.0, pose, send_delay_ns=0)
+                channels.publish_skeleton(encode_skeleton(packet), sequence)
+                sent.append((sequence, now_ns))
                 sequence += 1
                 due_s += FRAME_S
                 await asyncio.sleep(due_s - asyncio.get_running_loop().time())
@@ -114,7 +113,7 @@ async def send(settings: ProbeSettings) -> dict[str, Any]:
                 for window in (link.bulk.window for link in links.links):
                     now_ns, q_ms = CLOCK.now_ns(), window.queueing_delay_s * 1e3
                     what = window.window_bytes, window.in_flight_bytes, q_ms, window.rate_bytes_s * 8
-                    trace.append((now_ns, *what, links.skeleton_pace.divisor))
+                    trace.append((now_ns, *what, links.skeleton_divisor))
                 await asyncio.sleep(REPORT_S)
 
         def obey(line: str) -> None:
@@ -138,6 +137,7 @@ async def receive(settings: ProbeSettings) -> dict[str, Any]:
     """The receiver's end; what arrived, as JSON."""
     shown: list[tuple[int, int, int]] = []  # sequence number, when sent, when it arrived [ns]
     bulk: list[tuple[int, int]] = []  # when, bytes so far
+    taken = [(0, 1)]  # from when, 1 in how many skeletons
     meshes: list[tuple[int, int]] = []  # when, bytes
     name = receiver_name("lobby", settings.name) if settings.certificates else settings.name
     allowed = for_receiver(SITE, name) if settings.certificates else ()
@@ -148,6 +148,8 @@ async def receive(settings: ProbeSettings) -> dict[str, Any]:
         async def report() -> None:
             while True:
                 channels.send_report(len(meshes))
+                if channels.skeleton_divisor != taken[-1][1]:
+                    taken.append((CLOCK.now_ns(), channels.skeleton_divisor))
                 bulk.append((CLOCK.now_ns(), channels.subscribers["bulk"].arrived_bytes))
                 if channels.stream.lacks_body:
                     await channels.ask_body()
@@ -159,7 +161,7 @@ async def receive(settings: ProbeSettings) -> dict[str, Any]:
         channels.close()
         counts = channels.stream.skeletons.counts | channels.stream.assembler.counts
         counts["not fresh"] = channels.freshness.stale
-        return {"shown": shown, "bulk": bulk, "meshes": meshes, "counts": counts}
+        return {"shown": shown, "bulk": bulk, "meshes": meshes, "taken": taken, "counts": counts}
 
 
 def _receiving(

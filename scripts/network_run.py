@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import bisect
 import contextlib
 import json
 import shutil
@@ -64,12 +65,14 @@ class NetworkCase:
 @dataclass(frozen=True, slots=True)
 class Seen:
     """What a run saw; times are ns of the host's monotonic clock. ``sent``: sequence number → when. ``shown``: (when
-    sent, when shown). ``bulk``: (when, bytes so far). ``meshes``: (when, bytes) of whole ones. ``began_ns``: bulk."""
+    sent, when shown). ``bulk``: (when, bytes so far). ``meshes``: (when, bytes) of whole ones. ``taken``: (from when, 1
+    in how many skeletons the receiver took). ``began_ns``: bulk."""
 
     sent: dict[int, int]
     shown: list[tuple[int, int]]
     bulk: list[tuple[int, int]]
     meshes: list[tuple[int, int]]
+    taken: list[tuple[int, int]]
     counts: dict[str, int]
     window: dict[str, int]
     began_ns: int
@@ -95,10 +98,25 @@ class Seen:
         (first_ns, first), (last_ns, last) = inside[0], inside[-1]
         return (last - first) * 8 / (last_ns - first_ns) * NS
 
+    def divisor_at(self, when_ns: float) -> int:
+        """1 in how many skeletons the receiver took at a time."""
+        return self.taken[bisect.bisect_right(self.taken, when_ns, key=itemgetter(0)) - 1][1]
+
     def lost_share(self, begin_ns: float, end_ns: float) -> float:
-        """Of the skeletons sent in a span, those that were not shown."""
-        sent = [when for when in self.sent.values() if begin_ns <= when < end_ns]
-        return 1 - len(self.delays_ms(begin_ns, end_ns)) / len(sent) if sent else 0.0
+        """Of the skeletons sent in a span that the receiver took, those that were not shown."""
+        sent = self._sent_in(begin_ns, end_ns)
+        shown = {when for when, _ in self.shown}
+        return sum(self.sent[sequence] not in shown for sequence in sent) / len(sent) if sent else 0.0
+
+    def unseen_share(self, begin_ns: float, end_ns: float) -> float:
+        """Of the same, those that no packet after them repeated either."""
+        sent = self._sent_in(begin_ns, end_ns)
+        shown = {when for when, _ in self.shown}
+        unseen = (self.sent[s] not in shown and self.sent.get(s + 1) not in shown for s in sent)
+        return sum(unseen) / len(sent) if sent else 0.0
+
+    def _sent_in(self, begin_ns: float, end_ns: float) -> list[int]:
+        return [s for s, when in self.sent.items() if begin_ns <= when < end_ns and s % self.divisor_at(when) == 0]
 
     def back_to_ns(self, share_bps: float, from_ns: float, span_s: float = 1.0) -> float | None:
         """When goodput over the next second first reaches ``share_bps`` from a time on."""
@@ -236,6 +254,7 @@ def run_case(case: NetworkCase, folder: Path, idle_s: float = IDLE_S) -> Seen:
         shown=[(sent, shown) for _, sent, shown in receiver["shown"]],
         bulk=[(when, total) for when, total in receiver["bulk"]],
         meshes=[(when, size) for when, size in receiver["meshes"]],
+        taken=[(when, divisor) for when, divisor in receiver["taken"]],
         counts=receiver["counts"],
         window=sender["window"],
         began_ns=began_ns,

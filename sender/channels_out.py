@@ -11,6 +11,7 @@ from common.transport.channel_query import ChannelQueryable, Question
 from common.transport.channel_subscriber import Arrival, ChannelSubscriber
 from common.transport.channels import ANY, Channel, channel_key
 from common.transport.clock_exchange import serve_clock
+from common.transport.temporal_layers import LAYERS, layer_of
 from common.transport.zenoh_session import ZenohSession
 
 
@@ -22,7 +23,10 @@ class SenderChannels:
         self._site = site
         self._person = person
         self._clock = clock
-        self._skeleton = ChannelPublisher(session, channels.SKELETON, self._key(channels.SKELETON))
+        self._skeleton = tuple(
+            ChannelPublisher(session, channels.SKELETON, self._key(channels.SKELETON, layer=layer))
+            for layer in range(LAYERS)
+        )
         self._body = ChannelPublisher(session, channels.BODY, self._key(channels.BODY))
         self._body_message: bytes | None = None
         self.reports: ChannelSubscriber | None = None
@@ -48,13 +52,13 @@ class SenderChannels:
         self._body_message = message
         self._body.put(message)
 
-    def publish_skeleton(self, packet: bytes) -> None:
-        """One frame, to everyone at once."""
-        self._skeleton.put(packet)
+    def publish_skeleton(self, packet: bytes, sequence: int) -> None:
+        """One frame, to everyone who takes its layer."""
+        self._skeleton[layer_of(sequence)].put(packet)
 
     def bulk_publisher(self, receiver: str) -> ChannelPublisher:
         """The bulk channel of one receiver."""
         return ChannelPublisher(self._session, channels.BULK, self._key(channels.BULK, receiver))
 
-    def _key(self, channel: Channel, receiver: str | None = None) -> str:
-        return channel_key(channel, self._site, self._person, receiver)
+    def _key(self, channel: Channel, receiver: str | None = None, layer: int | None = None) -> str:
+        return channel_key(channel, self._site, self._person, receiver, layer)

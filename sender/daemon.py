@@ -234,9 +234,8 @@ class _Stream:
             self._channels.publish_body(tracked.body)
         if tracked.packet is None:
             return
-        if self._links.skeleton_pace.due(self._clock.now_ns()):
-            self._channels.publish_skeleton(tracked.packet)
-            self._published += 1
+        self._channels.publish_skeleton(tracked.packet, tracked.sequence)
+        self._published += 1
         self._skeleton_bytes_max = max(self._skeleton_bytes_max, len(tracked.packet))
         self._timer.add("capture to publish", self._clock.now_ns() - tracked.capture_ns)
         if self._settings.poses.enabled:
@@ -308,8 +307,8 @@ class _Stream:
         metrics.gauge("residual_level", "Of the newest residual packet [%]", lambda: self._residual_level)
         metrics.counter("dropped_total", "What was dropped, by cause", self._dropped)
         metrics.gauge("receivers", "Receivers there are", lambda: len(self._links.links))
-        about = "1 of so many skeletons is published, since a path carries no more"
-        metrics.gauge("skeleton_divisor", about, lambda: self._links.skeleton_pace.divisor)
+        about = "The receiver that takes fewest skeletons takes 1 in so many, since its path carries no more"
+        metrics.gauge("skeleton_divisor", about, lambda: self._links.skeleton_divisor)
         return metrics
 
     def _dropped(self) -> dict[str, float]:
@@ -326,7 +325,6 @@ class _Stream:
             "frame rejected": late.rejected,
             "frame lost by reader": getattr(self._source, "lost", 0) + getattr(self._source, "dropped", 0),
             "receiver refused": self._links.counts["refused"],
-            "skeleton, path too thin": self._links.skeleton_pace.left_out,
             **({f"report {cause}": count for cause, count in reports.counts.items()} if reports else {}),
         }
 

@@ -16,12 +16,11 @@ from common.transport.channel_publisher import ChannelPublisher
 from common.transport.channel_query import Question
 from common.transport.channel_subscriber import Arrival
 from common.transport.channels import receiver_of
-from common.wire.receiver_report import WANTS_RESIDUALS, ReceiverReport, decode_report
+from common.wire.receiver_report import WANTS_RESIDUALS, decode_report
 from common.wire.repository_list import RepositoryList, decode_repository_list, encode_repository_list
 from sender.candidate_poses.mesh_scheduler import MeshScheduler, SendRecord
 from sender.outgoing_bulk import Outgoing, OutgoingBulk, pose_name, poses_in
 from sender.residual_path import Residual
-from sender.skeleton_pace import SkeletonPace
 
 log = logging.getLogger(__name__)
 
@@ -34,7 +33,8 @@ LOOK_EVERY_S = 0.5
 @dataclass(slots=True)
 class ReceiverLink:
     """One run of one receiver. ``publisher`` carries its own bulk key. ``list_due_ns``: nothing is sent before, or
-    before the receiver told what it has. ``away``: its reports have stopped."""
+    before the receiver told what it has. ``away``: its reports have stopped. ``skeleton_divisor``: it takes 1 skeleton
+    in so many."""
 
     name: str
     receiver_epoch: int
@@ -45,6 +45,7 @@ class ReceiverLink:
     heard_ns: int
     list_due_ns: int = 0
     away: bool = False
+    skeleton_divisor: int = 1
 
 
 class ReceiverLinks:
@@ -67,7 +68,6 @@ class ReceiverLinks:
     ) -> None:
         self.counts: Counter[str] = Counter()
         self.delivered_poses = 0
-        self.skeleton_pace = SkeletonPace()
         self._residual_counts: Counter[str] = Counter()  # of links that are closed
         self._epoch = epoch
         self._scheduler = scheduler
@@ -82,6 +82,11 @@ class ReceiverLinks:
     def links(self) -> tuple[ReceiverLink, ...]:
         """The receivers there are now."""
         return tuple(link for link in self._links.values() if not link.away)
+
+    @property
+    def skeleton_divisor(self) -> int:
+        """The greatest of the receivers there are now."""
+        return max((link.skeleton_divisor for link in self.links), default=1)
 
     async def run(self) -> None:
         """Serve all links until cancelled; raises what one of them raised."""
@@ -99,7 +104,6 @@ class ReceiverLinks:
         for link in self.links:
             if now_ns - link.heard_ns > GONE_AFTER_NS:
                 link.away = True
-                self.skeleton_pace.forget(link.name)
                 self.counts["away"] += 1
                 log.info("receiver %s is away: no reports any more", link.name)
 
@@ -153,18 +157,9 @@ class ReceiverLinks:
             log.info("receiver %s is back", link.name)
         link.heard_ns = arrival.arrival_ns
         link.choice.wants_residuals = bool(report.wants & WANTS_RESIDUALS)
+        link.skeleton_divisor = report.skeleton_divisor
+        link.bulk.window.trickle = report.skeleton_divisor > 1  # its path does not even carry the skeletons
         link.bulk.on_report(report)
-        self._follow_path(link, report)
-
-    def _follow_path(self, link: ReceiverLink, report: ReceiverReport) -> None:
-        """Fewer skeletons, and next to no bulk, where the path cannot even carry the skeletons; and back."""
-        pace, before = self.skeleton_pace, self.skeleton_pace.divisor
-        window = link.bulk.window
-        pace.on_report(link.name, report, window.skeleton_queueing_s, window.at_floor, link.heard_ns)
-        window.trickle = pace.divisor_of(link.name) > 1
-        if pace.divisor != before:
-            q_ms = window.skeleton_queueing_s * 1e3
-            log.warning("1 of %d skeletons is sent: receiver %s, %.0f ms of queue", pace.divisor, link.name, q_ms)
 
     def on_repository(self, question: Question) -> bytes:
         """A receiver tells what it has; the answer is what there is here.
@@ -239,7 +234,6 @@ class ReceiverLinks:
         del self._links[link.name]
         link.task.cancel()
         link.publisher.close()
-        self.skeleton_pace.forget(link.name)
         self._scheduler.receiver_left(link.name)
         self._residual_counts += link.choice.counts
         self.counts["closed"] += 1

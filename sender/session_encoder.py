@@ -15,6 +15,7 @@ from common.runtime.session_recording import StoredMessage
 from common.runtime.stage_timer import StageTimer
 from common.transport import channels
 from common.transport.channels import Channel, channel_key
+from common.transport.temporal_layers import layer_of
 from sender.candidate_poses.candidate_pace import CandidatePace
 from sender.candidate_poses.mesh_scheduler import MeshScheduler, SendRecord
 from sender.capture.frame_set import DepthFrame, EndOfFrames, FrameSet, FrameSource
@@ -81,15 +82,16 @@ class SessionEncoder:
         self._count(frames)
         for chunk in self._bulk.chunks(now_ns):
             assert isinstance(chunk.name, tuple)
-            yield self._message(channels.BULK, chunk.time_ns, chunk.data, chunk.name[0], RECEIVER)
+            yield self._message(self._key(channels.BULK, RECEIVER), chunk.time_ns, chunk.data, chunk.name[0])
         tracked = self._skeletons.process(frames)
         if tracked.body is not None:
-            yield self._message(channels.BODY, now_ns, tracked.body, "skeleton")
+            yield self._message(self._key(channels.BODY), now_ns, tracked.body, "skeleton")
         if tracked.packet is None:
             return
         self.amount.skeletons += 1
         self._bulk.occupy(len(tracked.packet), now_ns)
-        yield self._message(channels.SKELETON, now_ns, tracked.packet, "skeleton")
+        key = self._key(channels.SKELETON, layer=layer_of(tracked.sequence))
+        yield self._message(key, now_ns, tracked.packet, "skeleton")
         if self._settings.poses.enabled:
             self._consider(tracked)
         if self._choice.wants_residuals:
@@ -116,12 +118,12 @@ class SessionEncoder:
             self.amount.residuals += 1
             self._choice.offer(residual)
 
-    def _message(
-        self, channel: Channel, time_ns: int, payload: bytes, layer: str, receiver: str | None = None
-    ) -> StoredMessage:
+    def _message(self, key: str, time_ns: int, payload: bytes, layer: str) -> StoredMessage:
         self.amount.layer_bytes[layer] += len(payload)
-        key = channel_key(channel, self._settings.site, self._settings.person, receiver)
         return StoredMessage(key, time_ns, payload)
+
+    def _key(self, channel: Channel, receiver: str | None = None, layer: int | None = None) -> str:
+        return channel_key(channel, self._settings.site, self._settings.person, receiver, layer)
 
     def _on_sent(self, record: SendRecord) -> None:
         self.amount.poses += 1

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from common.transport.channels import (
     ANY,
+    BODY,
     BULK,
     CHANNELS,
     REPORT,
@@ -20,7 +21,7 @@ from common.transport.channels import (
 
 
 def test_keys_name_schema_site_person_channel_and_receiver() -> None:
-    assert channel_key(SKELETON, "studio", 0) == "v1/studio/0/skeleton"
+    assert channel_key(SKELETON, "studio", 0, layer=2) == "v1/studio/0/skeleton/2"
     assert channel_key(BULK, "studio", 3, "wall") == "v1/studio/3/bulk/wall"
     assert channel_key(REPORT, "studio", 0, ANY) == "v1/studio/0/report/*"
     assert receiver_of("v1/studio/3/bulk/wall") == "wall"
@@ -49,9 +50,10 @@ def test_names_that_would_break_a_key_are_refused(name: str) -> None:
 @pytest.mark.parametrize(
     ("channel", "person", "receiver", "complaint"),
     [
-        (SKELETON, 0, "wall", "a receiver is not used"),
+        (BODY, 0, "wall", "a receiver is not used"),
         (BULK, 0, None, "a receiver is needed"),
-        (SKELETON, -1, None, "negative"),
+        (SKELETON, 0, None, "a layer is needed"),
+        (BODY, -1, None, "negative"),
         (BULK, 0, "a*", "receiver: "),
     ],
 )

@@ -17,12 +17,14 @@ from common.transport.channel_subscriber import Arrival
 from common.transport.channels import channel_key
 from common.transport.chunks import OutgoingMessage
 from common.transport.link_settings import LinkSettings
+from common.transport.temporal_layers import LAYERS
 from common.transport.zenoh_session import ZenohSession, open_session
 from common.wire.body_message import BodyMessage, encode_body
 from common.wire.receiver_report import decode_report
 from common.wire.repository_list import RepositoryList, decode_repository_list, encode_repository_list
 from common.wire.skeleton_packet import SkeletonPacket, encode_skeleton
 from receiver.channels_in import Handlers, ReceiverChannels
+from receiver.layer_subscription import LayerSubscription
 from scripts.daemon_processes import free_port
 from sender.channels_out import SenderChannels
 
@@ -69,7 +71,16 @@ class Ends:
 
     def raw(self, channel: channels.Channel, payload: bytes, receiver: str | None = None) -> None:
         """Put bytes as anyone on the network could."""
-        self.sending.zenoh.put(channel_key(channel, "studio", 0, receiver), payload)
+        layer = 0 if channel.layered else None
+        self.sending.zenoh.put(channel_key(channel, "studio", 0, receiver, layer), payload)
+
+    def publish(self, sequence: int, epoch: int = EPOCH) -> None:
+        self.sender.publish_skeleton(packet(sequence, epoch), sequence)
+
+    @property
+    def layers_heard(self) -> list[bool]:
+        """By the sender: of which layers somebody takes the skeletons."""
+        return [publisher.heard for publisher in self.sender._skeleton]
 
 
 @asynccontextmanager
@@ -81,7 +92,7 @@ async def ends() -> AsyncIterator[Ends]:
     ):
         made = Ends(sending, receiving)
         await until(lambda: made.heard["presence"] == [True])
-        await until(lambda: made.sender._skeleton.heard)
+        await until(lambda: all(made.layers_heard))
         yield made
 
 
@@ -93,12 +104,12 @@ async def until(condition: Callable[[], object], limit_s: float = 10.0) -> None:
 
 async def test_a_skeleton_is_handed_on_once_its_body_is_known():
     async with ends() as both:
-        both.sender.publish_skeleton(packet(0))
+        both.publish(0)
         await until(lambda: both.receiver.stream.counts["body unknown"] == 1)
         assert both.receiver.stream.lacks_body
         both.sender.publish_body(body())
         await until(lambda: both.heard["body"])
-        both.sender.publish_skeleton(packet(1))
+        both.publish(1)
         await until(lambda: both.heard["skeleton"] == [1])
         assert not both.receiver.stream.lacks_body
 
@@ -106,7 +117,7 @@ async def test_a_skeleton_is_handed_on_once_its_body_is_known():
 async def test_a_late_receiver_asks_for_the_body():
     async with ends() as both:
         both.sender._body_message = body()  # published before anyone listened
-        both.sender.publish_skeleton(packet(0))
+        both.publish(0)
         await until(lambda: both.receiver.stream.lacks_body)
         await both.receiver.ask_body()
         assert not both.receiver.stream.lacks_body
@@ -115,7 +126,7 @@ async def test_a_late_receiver_asks_for_the_body():
 async def test_what_is_here_is_told_and_what_is_there_is_learned():
     async with ends() as both:
         assert await both.receiver.ask_repository(EPOCH, {1: 100}) is None  # of whom, is not known yet
-        both.sender.publish_skeleton(packet(0))
+        both.publish(0)
         await until(lambda: both.receiver.stream.skeletons.newest)
         assert await both.receiver.ask_repository(EPOCH, {1: 100}) == {4: 400, 5: 500}
         assert await both.receiver.ask_repository(EPOCH - 1, {1: 100}) == {4: 400, 5: 500}
@@ -128,11 +139,11 @@ async def test_a_new_run_is_told_and_forgets_the_old_clock():
     async with ends() as both:
         both.sender.publish_body(body())
         await until(lambda: both.heard["body"])  # skeletons are more urgent, and would overtake it
-        both.sender.publish_skeleton(packet(0))
+        both.publish(0)
         await until(lambda: both.heard["skeleton"])
         await both.receiver.ask_time()
         assert both.receiver.clock_offset.known
-        both.sender.publish_skeleton(packet(0, epoch=EPOCH + 1))
+        both.publish(0, epoch=EPOCH + 1)
         await until(lambda: both.heard["epoch"])
         assert not both.receiver.clock_offset.known
 
@@ -189,7 +200,7 @@ async def test_after_closing_nothing_is_handed_on():
         both.sender.publish_body(body())
         await until(lambda: both.heard["body"])
         both.receiver.close()
-        both.sender.publish_skeleton(packet(0))
+        both.publish(0)
         await asyncio.sleep(0.1)
         assert both.heard["skeleton"] == []
 
@@ -213,3 +224,34 @@ async def test_a_vanished_sender_is_noticed(tmp_path):
             await until(lambda: presence == [True])
         await until(lambda: not presence[-1])
         assert presence == [True, False]
+
+
+class Decided(LayerSubscription):
+    """Takes as many layers as it is told."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.decided = LAYERS
+
+    def judge(self, lost: int, now_ns: int) -> bool:
+        before, self.layers = self.layers, self.decided
+        return self.layers != before
+
+
+async def test_layers_are_dropped_and_joined_in_order_and_nothing_counts_as_lost_for_it():
+    async with ends() as both:
+        both.receiver._layers = decided = Decided()
+        both.sender.publish_body(body())
+        await until(lambda: both.heard["body"])
+        heard = both.heard["skeleton"]
+        for first, layers in ((0, 4), (16, 2), (32, 3), (48, 4)):
+            decided.decided = layers
+            both.receiver.send_report(0)
+            await until(lambda layers=layers: both.layers_heard == [layer < layers for layer in range(LAYERS)])
+            for sequence in range(first, first + 16):
+                both.publish(sequence)
+                await until(lambda sequence=sequence: sequence % decided.divisor or sequence in heard)
+            assert [each for each in heard if each >= first] == list(range(first, first + 16, decided.divisor))
+            await until(lambda: both.reports)
+            assert decode_report(both.reports.pop().payload).skeleton_divisor == decided.divisor
+        assert both.receiver.stream.skeletons.counts["lost"] == 0

@@ -16,6 +16,7 @@ from common.runtime.http_access import HttpSettings
 from common.runtime.session_recording import SessionReader, SessionWriter, StoredMessage
 from common.transport.channels import CHANNELS
 from common.transport.chunks import ChunkAssembler, decode_chunk
+from common.transport.temporal_layers import LAYERS, layer_of
 from common.wire.residual_packet import is_residual
 from common.wire.skeleton_packet import decode_skeleton
 from receiver.cli import run_decode
@@ -60,13 +61,15 @@ def test_a_session_is_the_messages_of_the_channels_in_order(session):
     layers = {is_residual(message) for message in whole_messages(stored)}
     assert layers == {True, False}
     assert {message.key for message in stored} == {
-        f"v1/studio/0/{name}" for name in ("skeleton", "body", "bulk/session")
+        f"v1/studio/0/{name}" for name in (*(f"skeleton/{layer}" for layer in range(LAYERS)), "body", "bulk/session")
     }
     assert [message.time_ns for message in stored] == sorted(message.time_ns for message in stored)
-    skeletons = [message for message in stored if message.key.endswith("skeleton")]
+    skeletons = [message for message in stored if "/skeleton/" in message.key]
     assert len(skeletons) >= FRAMES - 5
     for message in skeletons:
-        assert decode_skeleton(message.payload).capture_ns == message.time_ns
+        packet = decode_skeleton(message.payload)
+        assert packet.capture_ns == message.time_ns
+        assert message.key.endswith(f"/{layer_of(packet.sequence)}")
 
 
 def whole_messages(stored: list[StoredMessage]) -> list[bytes]:

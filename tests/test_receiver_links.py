@@ -56,7 +56,14 @@ class Bench:
         self.publishers.setdefault(name, []).append(RecordingPublisher())
         return self.publishers[name][-1]
 
-    def report(self, name: str, receiver_epoch: int = 1, sender_epoch: int = EPOCH, poses: int = 0) -> None:
+    def report(
+        self,
+        name: str,
+        receiver_epoch: int = 1,
+        sender_epoch: int = EPOCH,
+        poses: int = 0,
+        skeleton_divisor: int = 1,
+    ) -> None:
         self._number += 1
         self.clock.advance(50_000_000)
         report = ReceiverReport(
@@ -74,6 +81,7 @@ class Bench:
             missing_chunks=(),
             body_revision=None,
             repository_poses=poses,
+            skeleton_divisor=skeleton_divisor,
         )
         key = f"v1/studio/0/report/{name}"
         self.links.on_report(Arrival(key, encode_report(report), self.clock.now_ns()))
@@ -305,3 +313,15 @@ async def test_a_malformed_report_opens_nothing():
         with pytest.raises(WireError):
             bench.links.on_report(Arrival("v1/studio/0/report/wall", b"\xff" * 20, 1))
         assert bench.links.links == ()
+
+
+async def test_who_takes_fewer_skeletons_gets_a_trickle_of_bulk_and_the_others_all() -> None:
+    async with running() as bench:
+        bench.report("thin", skeleton_divisor=255)
+        bench.report("wide")
+        trickling = {link.name: link.bulk.window.trickle for link in bench.links.links}
+        assert trickling == {"thin": True, "wide": False}
+        assert bench.links.skeleton_divisor == 255
+        bench.report("thin")
+        assert not any(link.bulk.window.trickle for link in bench.links.links)
+        assert bench.links.skeleton_divisor == 1

@@ -40,7 +40,7 @@ REPORT = ReceiverReport(
     body_revision=2,
     repository_poses=42,
     wants=WANTS_RESIDUALS,
-    skeletons=54_321,
+    skeleton_divisor=4,
 )
 SILENT = replace(
     REPORT, sender_epoch=None, skeleton_send_ns=None, skeleton_delay_ns=None, bulk_delay_ns=None, body_revision=None
@@ -61,6 +61,7 @@ LONGEST = ReceiverReport(
     body_revision=255,
     repository_poses=0xFFFF,
     wants=255,
+    skeleton_divisor=255,
 )
 
 
@@ -270,7 +271,7 @@ def test_the_golden_report_decodes_to_known_values_and_is_what_we_encode() -> No
         1,
         12,
         1,
-        321,
+        8,
     )
     assert astuple(decode_report(golden)) == expected
     assert encode_report(ReceiverReport(*expected)) == golden

@@ -11,8 +11,9 @@ def chunk(epoch: int, sequence: int, send_ns: int) -> Chunk:
 
 
 def test_a_report_before_anything_came() -> None:
-    report = Reception(5, 6).report(100, None, 0)
+    report = Reception(5, 6).report(100, None, 0, skeleton_divisor=4)
     assert (report.receiver_id, report.receiver_epoch, report.number, report.clock_ns) == (5, 6, 1, 100)
+    assert report.skeleton_divisor == 4
     assert report.sender_epoch is report.skeleton_send_ns is report.skeleton_delay_ns is report.bulk_delay_ns is None
 
 

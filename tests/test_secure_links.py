@@ -11,6 +11,7 @@ import subprocess
 import sys
 from collections.abc import AsyncIterator, Callable
 from contextlib import AsyncExitStack, asynccontextmanager
+from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,8 @@ from typing import Any
 import pytest
 import zenoh
 
+from common.body.skeleton import human_skeleton
+from common.body.skeleton_pose import rest_pose
 from common.runtime.clock import MonotonicClock
 from common.runtime.metrics import Metrics
 from common.transport import channels
@@ -27,12 +30,20 @@ from common.transport.channel_query import ChannelQueryable, ask
 from common.transport.channel_subscriber import Arrival, ChannelSubscriber
 from common.transport.channels import BODY, BULK, REPORT, REPOSITORY, SKELETON, Channel, channel_key
 from common.transport.link_settings import LinkSettings
+from common.transport.reception import Reception
 from common.transport.site_certificate import CertificateError, SiteCertificate, load_site_certificate
 from common.transport.zenoh_session import TransportError, ZenohSession, open_session
+from common.wire.body_message import BodyMessage, encode_body
+from common.wire.receiver_report import encode_report
+from common.wire.skeleton_packet import SkeletonPacket, encode_skeleton
+from receiver.channels_in import Handlers, ReceiverChannels
 from scripts.daemon_processes import free_port
 from scripts.hostile_peer import outsider, pair
 from scripts.make_certificates import new_authority, new_certificate, write_site
 from scripts.zenoh_router import router_values
+from sender.candidate_poses.mesh_scheduler import MeshScheduler
+from sender.channels_out import SenderChannels
+from sender.receiver_links import ReceiverLinks
 from tests.link_certificates import make_sites
 from tests.listening_sockets import listening_ports
 
@@ -47,7 +58,7 @@ def sites(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def key(channel: Channel, receiver: str | None = None, site: str = "studio") -> str:
-    return channel_key(channel, site, 0, receiver)
+    return channel_key(channel, site, 0, receiver, 0 if channel.layered else None)
 
 
 async def until(condition: Callable[[], object], limit_s: float = 10.0) -> None:
@@ -192,7 +203,7 @@ async def test_a_valid_certificate_opens_no_foreign_keys_in_either_direction(sit
             await until(lambda: len(studio.zenoh.info.links()) == 2)
             victim = "wall.1" if site == "lobby" else NAME
             foreign = [key(BULK, victim), key(REPORT, "*"), key(SKELETON, site="other"), "**"]
-            mine = ["v1/other/0/skeleton", key(REPORT, victim), key(SKELETON), key(BULK, victim), key(BODY)]
+            mine = ["v1/other/0/skeleton/0", key(REPORT, victim), key(SKELETON), key(BULK, victim), key(BODY)]
             kept = [
                 attacker.declare_subscriber(each, lambda sample: heard.append(str(sample.key_expr))) for each in foreign
             ]
@@ -345,6 +356,48 @@ async def test_what_is_wrong_with_a_certificate_is_said(tmp_path: Path, what: st
     with pytest.raises(CertificateError, match=complaint):
         async with open_session(LinkSettings(certificates=folder, connect=("127.0.0.1:1",))):
             pass
+
+
+async def test_no_report_of_one_receiver_costs_another_a_skeleton(sites: Path) -> None:
+    """An authorised one says that its path carries nothing, as fast as it can."""
+    port, epoch, came = free_port(), 9, list[int]()
+    allowed = for_sender("studio", ["lobby", "wall"])
+    async with (
+        open_session(listening(sites, port), allowed) as studio,
+        open_session(dialling(sites, port), for_receiver("studio", NAME)) as lobby,
+    ):
+        channels_out = SenderChannels(studio, "studio", 0, CLOCK)
+        links = ReceiverLinks(epoch, MeshScheduler(), channels_out.bulk_publisher, lambda _: None, CLOCK)
+        channels_out.open(links.on_report, links.on_repository, lambda: b"")
+        channels_out.publish_body(encode_body(BodyMessage(0, epoch, 1, human_skeleton(1.7), 30.0)))
+        channels_in = ReceiverChannels(lobby, "studio", 0, NAME, 1, 2, CLOCK)
+        nothing = lambda *_: None  # noqa: E731
+        channels_in.open(Handlers(lambda packet, *_: came.append(packet.sequence), nothing, nothing, nothing, nothing))
+        serving = asyncio.create_task(links.run())
+        wall = await asyncio.to_thread(outsider, pair(port), sites / "wall")
+        try:
+            await until(lambda: all(publisher.heard for publisher in channels_out._skeleton))
+            await channels_in.ask_body()
+            for number in range(120):
+                now_ns = CLOCK.now_ns()
+                packet = SkeletonPacket(0, epoch, number, now_ns, 1, 1.0, rest_pose())
+                channels_out.publish_skeleton(encode_skeleton(packet), number)
+                report = Reception(7, 7).report(now_ns, None, 0, skeleton_divisor=255)
+                late = {
+                    "number": number,
+                    "sender_epoch": epoch,
+                    "skeleton_send_ns": now_ns,
+                    "skeleton_delay_ns": number * 10**9,
+                }
+                wall.put(key(REPORT, "wall.1"), encode_report(replace(report, **late)))
+                channels_in.send_report(0)
+                await asyncio.sleep(1 / 30)
+            await until(lambda: len(came) == 120, 2)
+            assert links.skeleton_divisor == 255  # they were heard
+        finally:
+            serving.cancel()
+            await asyncio.to_thread(_close, wall)
+    assert came == list(range(120))
 
 
 async def test_the_self_view_s_socket_needs_no_certificate_and_opens_nothing_else(sites: Path, tmp_path: Path) -> None:

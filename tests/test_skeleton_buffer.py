@@ -46,6 +46,24 @@ def test_late_and_repeated_packets_are_dropped_and_counted():
     assert (buffer.counts["stale"], buffer.counts["duplicate"], buffer.counts["lost"]) == (1, 1, 2)
 
 
+def test_what_layers_have_that_are_not_taken_is_not_lost():
+    buffer = fed(0, 1, 2, 4)  # 3 is lost
+    buffer.take(3)
+    for sequence in (6, 8, 12):  # 10 is lost
+        assert buffer.push(packet(sequence), sequence * FRAME_NS)
+    assert buffer.counts["lost"] == 2
+
+
+def test_of_a_layer_that_is_joined_nothing_is_lost_before_its_first_packet():
+    buffer = fed(0)
+    buffer.take(2)
+    buffer.push(packet(4), 4 * FRAME_NS)
+    buffer.take(4)  # asked for, but on its way
+    for sequence in (8, 12, 16, 17, 18, 20):  # 19 is lost
+        assert buffer.push(packet(sequence), sequence * FRAME_NS)
+    assert buffer.counts["lost"] == 1
+
+
 def test_a_new_epoch_takes_over_and_the_old_one_never_returns():
     buffer = fed(100, 101)
     assert buffer.push(packet(1, epoch=2, capture_ns=5), 102 * FRAME_NS)

@@ -52,6 +52,13 @@ def test_before_anything_came_it_waits():
     assert not state.receiving
 
 
+def test_that_a_path_carries_fewer_skeletons_is_said():
+    state = StreamState(ManualClock())
+    state.skeleton()
+    assert "path" not in state.status(None, 0, 0, skeleton_divisor=1).detail
+    assert state.status(None, 0, 0, skeleton_divisor=4).detail.startswith("1 in 4 skeletons")
+
+
 def test_a_sender_without_a_person_is_told_apart_from_no_sender():
     state = StreamState(ManualClock())
     state.presence(True)

@@ -49,7 +49,7 @@ from common.wire.receiver_report import ReceiverReport, decode_report, encode_re
 
 WITHIN_S = 10.0
 OFFSET_NS = 5_000_000_000_000
-KEY = channel_key(SKELETON, "studio", 0)
+KEY = channel_key(SKELETON, "studio", 0, layer=0)
 
 
 @pytest.fixture
@@ -482,7 +482,7 @@ from common.transport.channels import *
 from common.transport.link_settings import LinkSettings
 from common.transport.zenoh_session import open_session
 set_up_logging()
-key = channel_key(SKELETON, "studio", 0)
+key = channel_key(SKELETON, "studio", 0, layer=0)
 async def main(daemon):
     async with open_session(LinkSettings({role}=("{endpoint}",))) as session:
         session.declare_presence(channel_key(SENDER_PRESENCE, "studio", 0))

@@ -123,7 +123,7 @@ def _rules(realm: str, allowance: Allowance, party: Party, flow: str, number: in
             "permission": "allow",
             "flows": [flow],
             "messages": list(messages),
-            "key_exprs": [f"{stream}/{channel.key.format(receiver=receivers)}" for channel in table],
+            "key_exprs": [f"{stream}/{channel.key.format(receiver=receivers, layer=ANY)}" for channel in table],
         }
         for row, (messages, table, receivers) in enumerate(rows)
     ]

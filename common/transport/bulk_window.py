@@ -17,6 +17,7 @@ from common.wire.receiver_report import ReceiverReport
 
 NS = 1e-9
 FIRST_WINDOW_BYTES = 16 << 10
+FLOOR_BPS = 100_000
 CHUNK_LEAST_BYTES = 1200
 CHUNK_HOLDS_S = 0.005  # how long one chunk may hold up a skeleton behind it on the link
 PACING = 1.1  # of the window per round trip: a little more than it allows, so that pacing is not the limit
@@ -34,7 +35,7 @@ class WindowSettings:
     ``max_window_bytes``: most bytes in flight. ``report_period_ms``: how often the receiver reports [ms]."""
 
     target_ms: float = 7.0
-    floor_bps: int = 100_000
+    floor_bps: int = FLOOR_BPS
     max_window_bytes: int = 4 << 20
     report_period_ms: float = 50.0
 
@@ -112,11 +113,6 @@ class BulkWindow:
         return self._path.queueing_s
 
     @property
-    def skeleton_queueing_s(self) -> float:
-        """How long skeletons wait in queues on the way, at the last report that said so."""
-        return self._path.skeleton_queueing_s
-
-    @property
     def rate_bytes_s(self) -> float:
         """R̂: what the path delivers [bytes/s]; before the first sample 16 KB per round trip."""
         if not self._rates:
@@ -129,11 +125,6 @@ class BulkWindow:
 
         For streams that adapt to it: were they to follow what they sent themselves, they would never send more."""
         return self._window / (self._path.round_trip_s + self._period_s)
-
-    @property
-    def at_floor(self) -> bool:
-        """The window is about as small as it gets: there is no more to give way with."""
-        return self.trickle or self._window <= 1.5 * self._least_window
 
     @property
     def chunk_bytes(self) -> int:

@@ -26,7 +26,8 @@ class Arrival:
 
 
 class ChannelSubscriber:
-    """Calls ``on_arrival`` on the loop for the payloads that come under ``key`` (an expression, perhaps).
+    """Calls ``on_arrival`` on the loop for the payloads that come under ``key`` (an expression, perhaps) and the keys
+    that are added later, in the order in which they come.
 
     At most ``channel.keep`` payloads wait for the loop; when more come the oldest go. A ``WireError`` raised by
     ``on_arrival`` means a malformed payload. ``counts``: "size", "flooded", "malformed"; ``last_error`` has the latest
@@ -48,12 +49,27 @@ class ChannelSubscriber:
         self._waiting: deque[Arrival] = deque(maxlen=channel.keep)
         self._woken = False
         self._closed = False
-        self._subscriber = session.zenoh.declare_subscriber(key, Callback(self._came, indirect=False))
+        self._subscribers: dict[str, zenoh.Subscriber[None]] = {}
+        self.add(key)
+
+    def add(self, key: str) -> None:
+        """Hear what comes under this key as well."""
+        declared = self._session.zenoh.declare_subscriber(key, Callback(self._came, indirect=False))
+        self._subscribers[key] = declared
+
+    def remove(self, key: str) -> None:
+        """Hear no more of what comes under a key; others upstream need not send it then.
+
+        Raises:
+            KeyError: it was not heard.
+        """
+        self._subscribers.pop(key).undeclare()  # type: ignore[no-untyped-call]
 
     def close(self) -> None:
-        """Undeclare the subscriber; what still waits for the loop is dropped."""
+        """Undeclare all; what still waits for the loop is dropped."""
         self._closed = True
-        self._subscriber.undeclare()  # type: ignore[no-untyped-call]
+        for key in list(self._subscribers):
+            self.remove(key)
 
     def _came(self, sample: zenoh.Sample) -> None:
         """On a thread of Zenoh: copy and hand over, nothing else, since the link waits meanwhile."""

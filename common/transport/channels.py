@@ -6,11 +6,12 @@ Keys are ``v1/<site>/<person>/<channel>``; the realm goes in front of them as th
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Final, Literal
 
 import zenoh
 
 SCHEMA = "v1"
-ANY = "*"  # in place of a receiver: a key expression that matches every receiver
+ANY: Final = "*"  # in place of a receiver or a layer: a key expression that matches every one
 NAME_MAX_BYTES = 64
 _FORBIDDEN = frozenset("*$?#/")
 
@@ -19,7 +20,8 @@ _FORBIDDEN = frozenset("*$?#/")
 class Channel:
     """One row of the table.
 
-    ``key``: below the person, with ``{receiver}`` where each receiver has its own. ``min_bytes``, ``max_bytes``: of a
+    ``key``: below the person, with ``{receiver}`` where each receiver has its own, ``{layer}`` where each temporal
+    layer has. ``min_bytes``, ``max_bytes``: of a
     payload; others are refused at both ends. ``keep``: how many payloads may wait for the receiving loop; when more
     come the oldest go, so 1 means that only the newest counts. ``recorded``: whether a session recording holds it.
 
@@ -44,11 +46,15 @@ class Channel:
     def per_receiver(self) -> bool:
         return "{receiver}" in self.key
 
+    @property
+    def layered(self) -> bool:
+        return "{layer}" in self.key
+
 
 _BEST_EFFORT, _RELIABLE = zenoh.Reliability.BEST_EFFORT, zenoh.Reliability.RELIABLE
 _P = zenoh.Priority
 
-SKELETON = Channel("skeleton", _P.REAL_TIME, _BEST_EFFORT, 250, express=True, keep=4)
+SKELETON = Channel("skeleton/{layer}", _P.REAL_TIME, _BEST_EFFORT, 250, express=True, keep=4)
 BODY = Channel("body", _P.DATA_HIGH, _RELIABLE, 16 << 10, keep=4)
 BULK = Channel("bulk/{receiver}", _P.DATA_LOW, _RELIABLE, 32 << 10, keep=512)
 REPORT = Channel("report/{receiver}", _P.REAL_TIME, _BEST_EFFORT, 1 << 10, express=True, keep=8)
@@ -77,19 +83,23 @@ def check_name(what: str, name: str) -> str:
     return name
 
 
-def channel_key(channel: Channel, site: str, person: int, receiver: str | None = None) -> str:
-    """The key of a person's channel, e.g. ``v1/studio/0/bulk/wall``; ``receiver`` may be ``ANY``.
+def channel_key(
+    channel: Channel, site: str, person: int, receiver: str | None = None, layer: int | Literal["*"] | None = None
+) -> str:
+    """The key of a person's channel, e.g. ``v1/studio/0/bulk/wall``; ``receiver`` and ``layer`` may be ``ANY``.
 
     Raises:
-        ValueError: a bad name, a negative person, or a receiver missing or too many for this channel.
+        ValueError: a bad name, a negative person, or a receiver or layer missing or too many for this channel.
     """
+    if channel.layered != (layer is not None):
+        raise ValueError(f"channel {channel.name}: a layer is {'needed' if channel.layered else 'not used'}")
     if channel.per_receiver != (receiver is not None):
         raise ValueError(f"channel {channel.name}: a receiver is {'needed' if channel.per_receiver else 'not used'}")
     if person < 0:
         raise ValueError(f"person: {person} is negative")
     if receiver is not None and receiver != ANY:
         check_name("receiver", receiver)
-    return f"{SCHEMA}/{check_name('site', site)}/{person}/{channel.key.format(receiver=receiver)}"
+    return f"{SCHEMA}/{check_name('site', site)}/{person}/{channel.key.format(receiver=receiver, layer=layer)}"
 
 
 def receiver_of(key: str) -> str:

@@ -16,7 +16,7 @@ BUCKET_NS, BUCKETS = 5_000_000_000, 12  # a minute: two clocks part by less than
 BULK_SHARE = 0.5  # how much of the delay that only chunks see counts
 
 
-class _LeastOfLate:
+class LeastOfLate:
     """The least value of the last ``BUCKETS`` x 5 s that had any."""
 
     def __init__(self) -> None:
@@ -39,9 +39,8 @@ class PathDelay:
     def __init__(self) -> None:
         self.round_trip_s = 0.2  # until the first sample
         self.queueing_s = 0.0
-        self.skeleton_queueing_s = 0.0  # without what only chunks wait for
-        self._round_trips_ns = _LeastOfLate()
-        self._delays_ns = _LeastOfLate()
+        self._round_trips_ns = LeastOfLate()
+        self._delays_ns = LeastOfLate()
 
     @property
     def least_round_trip_s(self) -> float:
@@ -68,8 +67,6 @@ class PathDelay:
         assert base_ns is not None
         # Skeletons are few: what all the chunks of the same period escaped was jitter and no queue.
         seen_s = (min(delays_ns) - base_ns) * NS if d_s is not None else 0.0
-        if d_s is not None:
-            self.skeleton_queueing_s = seen_s
         # Chunks may queue where skeletons do not, above a second link say: without this the window would not see it.
         own_s = ((d_b - base_ns) * NS - chunk_s) * BULK_SHARE if d_b is not None else 0.0
         self.queueing_s = max(seen_s, own_s, 0.0)

@@ -20,14 +20,12 @@ class Reception:
         self._arrivals = BulkArrivals()
         self._skeleton_delay, self._bulk_delay = LeastDelay(), LeastDelay()
         self._skeleton: tuple[int, int] | None = None  # the newest one: when sent, when it arrived
-        self._skeletons = 0
 
     def skeleton(self, epoch: int, send_ns: int, arrival_ns: int) -> None:
         """The newest skeleton so far arrived. Times by the sender's clock and by the receiver's."""
         if epoch != self._sender_epoch:
             self._begin(epoch)
         self._skeleton = send_ns, arrival_ns
-        self._skeletons += 1
         self._skeleton_delay.note(send_ns, arrival_ns)
 
     def chunk(self, chunk: Chunk, size: int, arrival_ns: int) -> None:
@@ -37,7 +35,14 @@ class Reception:
         self._arrivals.note(chunk, size)
         self._bulk_delay.note(chunk.send_ns, arrival_ns)
 
-    def report(self, now_ns: int, body_revision: int | None, repository_poses: int, wants: int = 0) -> ReceiverReport:
+    def report(
+        self,
+        now_ns: int,
+        body_revision: int | None,
+        repository_poses: int,
+        wants: int = 0,
+        skeleton_divisor: int = 1,
+    ) -> ReceiverReport:
         """The next report; delays in it are those since the one before."""
         self._number += 1
         next_chunk, missing = self._arrivals.resolved()
@@ -57,5 +62,5 @@ class Reception:
             body_revision=body_revision,
             repository_poses=repository_poses,
             wants=wants,
-            skeletons=self._skeletons,
+            skeleton_divisor=skeleton_divisor,
         )

@@ -45,7 +45,7 @@ class ReceiverReport:
     ``MAX_MISSING_CHUNKS`` it is the first one not listed.
     ``body_revision``: of the newest body message held, None: none. ``repository_poses``: candidate poses held.
     ``wants``: bits, what it has a use for beside candidate poses; bits unknown here mean nothing.
-    ``skeletons``: how many came in this sender epoch that were the newest then.
+    ``skeleton_divisor``: of the skeletons it takes 1 in so many, since its path carries no more; 1: all.
     """
 
     number: int
@@ -63,7 +63,7 @@ class ReceiverReport:
     body_revision: int | None
     repository_poses: int
     wants: int = 0
-    skeletons: int = 0
+    skeleton_divisor: int = 1
 
 
 _FIELD_NAMES = [field.name for field in fields(ReceiverReport)]
@@ -82,7 +82,7 @@ _RANGES = {
     "body_revision": (0, U8_MAX),
     "repository_poses": (0, REPOSITORY_MAX_POSES),
     "wants": (0, U8_MAX),
-    "skeletons": (0, U32_MAX),
+    "skeleton_divisor": (1, U8_MAX),
 }
 _OPTIONAL = {"sender_epoch", "skeleton_send_ns", "skeleton_delay_ns", "bulk_delay_ns", "body_revision"}
 
