@@ -127,7 +127,7 @@ class _Show:
         self._mesher = ThreadPoolExecutor(1, "mesher", into_background)
         self._messages: asyncio.Queue[bytes] = asyncio.Queue(MESHES_WAITING)
         self._held: tuple[int, dict[int, int]] = (-1, {})  # sender's run; bytes of the poses taken in, by id
-        self._offered_poses = 0
+        self._offered_poses = self._poses_received = self._poses_meshed = 0
         self._appeared = asyncio.Event()
         self._meshes: deque[ReceivedPose] = deque()  # meshed, waiting for the next skeleton; bounded in _mesh_poses
         self._newest: SkeletonToShow | None = None
@@ -211,6 +211,7 @@ class _Show:
     def _on_pose(self, message: bytes) -> None:
         """A candidate pose is complete; when too many wait for meshing the oldest goes."""
         self._record("pose", message)
+        self._poses_received += 1
         if self._messages.full():
             self._messages.get_nowait()
             self._counts["pose waiting too long"] += 1
@@ -231,9 +232,10 @@ class _Show:
                 self._counts["pose refused"] += 1
                 log.warning("a candidate pose is refused: %s", error)
                 continue
+            self._poses_meshed += 1
             while len(self._meshes) >= MESHES_WAITING:  # no skeletons come: nobody takes them
                 self._meshes.popleft()
-                self._counts["pose waiting too long"] += 1
+                self._counts["mesh waiting too long"] += 1
             self._meshes.append(mesh)
             self._note_held(mesh.epoch, mesh.mesh.pose_id, len(message))
             if self._state.first_body_ns is None and self._newest is not None:
@@ -337,6 +339,15 @@ class _Show:
         metrics.counter("skeletons_lost_total", "Gaps in the sequence", lambda: skeletons["lost"])
         about = "1 in so many skeletons is taken, since the path carries no more"
         metrics.gauge("skeleton_divisor", about, lambda: self._channels.skeleton_divisor)
+        arrivals = self._channels.subscribers
+        metrics.counter(
+            "arrived_total",
+            "Messages, by channel",
+            lambda: {name: subscriber.arrivals for name, subscriber in arrivals.items()},
+            "channel",
+        )
+        metrics.counter("candidate_poses_received_total", "Arrived whole", lambda: self._poses_received)
+        metrics.counter("candidate_poses_meshed_total", "Ready to be shown", lambda: self._poses_meshed)
         metrics.counter("frames_shown_total", "Frames given to the viewer", lambda: self._state.frames_shown)
         metrics.counter("points_shown_total", "Residual packets given to the viewer", lambda: self._points.made)
         metrics.counter("dropped_total", "What was dropped, by cause", self._dropped)
@@ -354,7 +365,7 @@ class _Show:
     def _dropped(self) -> dict[str, float]:
         channels = self._channels
         judged = {f"skeleton {cause}": channels.stream.skeletons.counts[cause] for cause in
-                  ("stale", "duplicate", "old_epoch", "far_future", "lost")}  # fmt: skip
+                  ("stale", "duplicate", "old_epoch", "far_future", "lost", "not taken")}  # fmt: skip
         refused = {
             f"{name} {cause}": count
             for name, subscriber in channels.subscribers.items()

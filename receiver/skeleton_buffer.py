@@ -19,7 +19,7 @@ FUTURE_RUN = 10  # so many packets from the future, each fit to follow the one b
 
 class SkeletonBuffer:
     """Judges each arriving packet. ``counts``: accepted, duplicate, stale, old_epoch, far_future, lost (of the layers
-    taken), epochs."""
+    taken), not taken (of the others), epochs."""
 
     def __init__(self) -> None:
         self.newest: SkeletonPacket | None = None
@@ -50,7 +50,9 @@ class SkeletonBuffer:
             if self.newest is not None:
                 self._retired.append(self.newest.epoch)
         else:
-            self.counts["lost"] += between(self.newest.sequence, packet.sequence, self._coming)
+            lost = between(self.newest.sequence, packet.sequence, self._coming)
+            self.counts["lost"] += lost
+            self.counts["not taken"] += packet.sequence - self.newest.sequence - 1 - lost
         self._coming = max(self._coming, min(layer_of(packet.sequence) + 1, self._taken))
         self.newest, self._arrival_ns = packet, now_ns
         self._ahead, self._ahead_run = None, 0

@@ -7,6 +7,7 @@ delivered packets too late is void: what it measured says something of this mach
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import json
 import os
 import shutil
@@ -22,6 +23,8 @@ from scripts.link_model import LinkConditions, as_values
 Side = Literal["A", "B"]
 VOID_MS = 2.0  # of lateness at its 99th percentile
 _END_WITHIN_S = 5.0
+_CLONE_NEWNET = 0x40000000
+_libc = ctypes.CDLL(None, use_errno=True)
 
 
 class EmulationError(Exception):
@@ -76,6 +79,16 @@ class EmulatedNetwork:
         """The command line that runs ``command`` on a side."""
         return ["nsenter", f"--net=/proc/{self._holders[side]}/ns/net", "--", *command]
 
+    @contextlib.contextmanager
+    def inside(self, side: Side) -> Iterator[None]:
+        """Sockets that this thread makes within the context are on that side."""
+        with open("/proc/thread-self/ns/net") as home, open(f"/proc/{self._holders[side]}/ns/net") as there:
+            _enter(there.fileno())
+            try:
+                yield
+            finally:
+                _enter(home.fileno())
+
     def change(self, direction: Literal["there", "back", "both"] = "both", **conditions: Any) -> None:
         """Other conditions from now on, by the names of ``LinkConditions`` as in ``conditions_from``."""
         self._tell({direction: conditions})
@@ -99,6 +112,11 @@ class EmulatedNetwork:
             raise EmulationError(f"the link emulator ended with {self._process.wait(_END_WITHIN_S)}")
         answer: dict[str, Any] = json.loads(line)
         return answer
+
+
+def _enter(namespace: int) -> None:
+    if _libc.setns(namespace, _CLONE_NEWNET) != 0:
+        raise EmulationError(f"a namespace cannot be entered: {os.strerror(ctypes.get_errno())}")
 
 
 @contextlib.contextmanager

@@ -187,6 +187,7 @@ class _Stream:
         self._candidate_work_ns = 0
         self._pace = CandidatePace(int(settings.poses.interval_ms * 1e6), settings.poses.busy_share)
         self._published = 0
+        self._nobody = 0
         self._poses_sent = 0
         self._residual_level = 0.0
         self._skeleton_bytes_max = 0
@@ -233,6 +234,7 @@ class _Stream:
         if tracked.body is not None:
             self._channels.publish_body(tracked.body)
         if tracked.packet is None:
+            self._nobody += 1
             return
         self._channels.publish_skeleton(tracked.packet, tracked.sequence)
         self._published += 1
@@ -300,7 +302,10 @@ class _Stream:
         metrics.counter("frames_captured_total", "Frames read, all cameras", lambda: self._capture.frames)
         metrics.counter("frame_sets_total", "Synchronised sets", lambda: self._capture.sets)
         metrics.counter("skeletons_published_total", "Skeleton packets published", lambda: self._published)
-        metrics.counter("candidate_poses_sent_total", "Deliveries", lambda: self._poses_sent)
+        metrics.counter("candidate_poses_sent_total", "Deliveries begun", lambda: self._poses_sent)
+        metrics.counter("candidate_poses_delivered_total", "Arrived whole", lambda: self._links.delivered_poses)
+        metrics.counter("candidate_poses_given_up_total", "On their way no more", lambda: self._links.given_up_poses)
+        metrics.gauge("candidate_poses_under_way", "Begun, and not yet arrived", lambda: self._links.poses_under_way)
         residuals = self._links.residual_counts
         metrics.counter("residual_packets_sent_total", "Deliveries", lambda: residuals()["sent"])
         metrics.counter("residual_bytes_total", "Of residual packets sent", lambda: residuals()["bytes"])
@@ -316,6 +321,7 @@ class _Stream:
         reports = self._channels.reports
         return {
             "fitting busy": self._fitting.dropped,
+            "nobody in view": self._nobody,
             "candidates busy": self._meshing.dropped,
             "residuals busy": self._mapping.dropped,
             "residual stale": self._links.residual_counts()["dropped"],

@@ -68,6 +68,7 @@ class ReceiverLinks:
     ) -> None:
         self.counts: Counter[str] = Counter()
         self.delivered_poses = 0
+        self.given_up_poses = 0  # superseded, or their receiver left
         self._residual_counts: Counter[str] = Counter()  # of links that are closed
         self._epoch = epoch
         self._scheduler = scheduler
@@ -87,6 +88,11 @@ class ReceiverLinks:
     def skeleton_divisor(self) -> int:
         """The greatest of the receivers there are now."""
         return max((link.skeleton_divisor for link in self.links), default=1)
+
+    @property
+    def poses_under_way(self) -> int:
+        """Candidate poses begun and not yet arrived, to all receivers."""
+        return sum(_poses_under_way(link) for link in self._links.values())
 
     async def run(self) -> None:
         """Serve all links until cancelled; raises what one of them raised."""
@@ -111,7 +117,7 @@ class ReceiverLinks:
         """The scheduler has something new, which may be better than what is on its way."""
         for link in self._links.values():
             for pose_id in self._scheduler.superseded(link.name, poses_in(link.bulk.under_way)):
-                link.bulk.cancel(pose_name(pose_id))
+                self.given_up_poses += link.bulk.cancel(pose_name(pose_id))
                 self.counts["superseded"] += 1
                 log.debug("pose %d is on its way to %s no more: superseded", pose_id, link.name)
             link.bulk.wake()
@@ -205,7 +211,7 @@ class ReceiverLinks:
             return _message(choice.next_urgent())
 
         def delivered(message: Hashable) -> None:
-            self.delivered_poses += isinstance(message, tuple) and message[0] == "pose"
+            self.delivered_poses += _is_pose(message)
             log.debug("%s delivered to %s", message, name)
 
         window = BulkWindow(self._epoch)
@@ -232,6 +238,7 @@ class ReceiverLinks:
 
     def _close(self, link: ReceiverLink, why: str) -> None:
         del self._links[link.name]
+        self.given_up_poses += _poses_under_way(link)
         link.task.cancel()
         link.publisher.close()
         self._scheduler.receiver_left(link.name)
@@ -244,6 +251,14 @@ def _message(chosen: Outgoing | None) -> BulkMessage | None:
     if chosen is None:
         return None
     return BulkMessage(chosen.name, chosen.payload, chosen.supersedes, chosen.urgent)
+
+
+def _poses_under_way(link: ReceiverLink) -> int:
+    return sum(_is_pose(name) for name in link.bulk.under_way)
+
+
+def _is_pose(name: Hashable) -> bool:
+    return isinstance(name, tuple) and name[0] == "pose"
 
 
 def _site(receiver: str) -> str:

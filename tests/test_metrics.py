@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections import Counter
 
 import aiohttp
@@ -69,6 +70,8 @@ async def test_others_may_add_routes_to_the_same_application() -> None:
         status, text = await get(port, "/metrics")
     assert status == 200
     assert "telepose_age_ms 1.0" in text
+    assert re.search(r"(?m)^telepose_tasks [1-9]", text)
+    assert re.search(r"(?m)^telepose_threads [1-9]", text)
 
 
 async def test_a_port_in_use_is_named() -> None:

@@ -169,6 +169,7 @@ async def test_a_restarted_receiver_is_served_from_the_start():
         assert first.closed
         assert not second.closed
         assert [record.pose_id for record in bench.records] == [1, 1]
+        assert (bench.links.given_up_poses, bench.links.poses_under_way) == (1, 1)
 
 
 async def test_silence_is_noticed_and_the_link_kept():
@@ -287,7 +288,10 @@ async def test_a_pose_on_its_way_is_cancelled_at_the_next_chunk_when_a_better_on
         bench.links.wake()
         while b"better" * 100 not in receiver.messages:
             await receiver.live(1)
-        assert bench.links.counts["superseded"] == 1
+        assert bench.links.counts["superseded"] == bench.links.given_up_poses == 1
+        await receiver.live(5)
+        whole = bench.links.delivered_poses + bench.links.given_up_poses + bench.links.poses_under_way
+        assert len(bench.records) == whole
         assert receiver.chunk_bytes < len(long) / 2
         assert long not in receiver.messages
 

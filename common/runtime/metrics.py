@@ -5,7 +5,9 @@ Counters live where things are counted, in plain integers; this module reads the
 
 from __future__ import annotations
 
+import asyncio
 import ssl
+import threading
 from collections import Counter
 from collections.abc import AsyncIterator, Callable, Iterable, Mapping
 from contextlib import asynccontextmanager
@@ -118,6 +120,8 @@ def daemon_app(metrics: Metrics, health: Health, token: str | None = None) -> we
     async def numbers(_: web.Request) -> web.Response:
         return web.Response(body=metrics.text(), headers={"Content-Type": CONTENT_TYPE})
 
+    metrics.gauge("tasks", "Tasks of the loop that have not ended", lambda: len(asyncio.all_tasks()))
+    metrics.gauge("threads", "Threads that run Python", threading.active_count)
     refused: Counter[str] = Counter()
     app = web.Application(middlewares=[require_token(token, refused)] if token is not None else [])
     if token is not None:
