@@ -17,8 +17,12 @@ from common.body.distortion_score import distortion_score
 from common.body.rigged_mesh import MESH_STRIDE, RiggedMesh, build_rigged_mesh, merged
 from common.body.rigging import Rigging, Segmentation
 from common.body.skinning import Skinning, animate, link_motion
+from common.body.surface_border import border_of
+from common.body.surface_normals import normals_and_incidence
 from common.body.view import View
-from common.body.zipper import SURFACE_EDGE_M, Zippered, zippered
+from common.body.view_overlap import SURFACE_EDGE_M, overlap
+from common.body.view_squares import ViewSquares, view_squares
+from common.body.zipper import Zippered, zippered
 from common.geometry.camera_model import Camera
 from common.geometry.rasterizer import render_crop
 from common.geometry.rigid_transform import look_at
@@ -142,6 +146,50 @@ def test_one_view_stays_as_it_is() -> None:
     assert len(one.mesh.faces) - one.faces_stitched == len(mesh.faces)
     assert one.faces_stitched < 10  # holes of three edges
     np.testing.assert_array_equal(one.weld, np.arange(len(one.weld)))
+
+
+def views_overlap(views: list[View]) -> tuple[ViewSquares, NDArray[np.float32], NDArray[np.bool_], NDArray[np.float32]]:
+    """What ``overlap`` finds in views of the ball: squares, vertices, which are redundant, and the consensus."""
+    meshes = [mesh_view(view, MESH_STRIDE) for view in views]
+    whole = merged(meshes)
+    eyes = np.array([view.camera.T_world_camera[:3, 3] for view in views], np.float32)
+    squares = view_squares(whole.vertices, meshes, views, MESH_STRIDE)
+    normals, quality = normals_and_incidence(whole.vertices, whole.faces, eyes, squares.view_of, 3)
+    outline = border_of(whole.faces, len(normals))
+    redundant, consensus = overlap(whole.vertices, normals, quality, outline, eyes, squares)
+    return squares, whole.vertices, redundant, consensus
+
+
+def test_squares_know_their_vertices() -> None:
+    views = [ball_view(eye, 100) for eye in RING[:2]]
+    squares, vertices, _, _ = views_overlap(views)
+    np.testing.assert_array_equal(squares.at[squares.own], np.arange(len(vertices)))
+    own = squares.square[squares.view_of, np.arange(len(vertices))]
+    assert (own == squares.own).mean() > 0.99  # outermost ones may be moved out of theirs
+    beyond = squares.square[1] == -1  # where the other view, at right angles, is not looking
+    assert not beyond[np.linalg.norm(vertices, axis=1) < RADIUS_M + 0.01].any()
+
+
+def test_of_two_vertices_in_a_place_the_better_seen_one_is_kept() -> None:
+    squares, vertices, redundant, _ = views_overlap([ball_view(eye, 100) for eye in RING[:2]])
+    seen = vertices[:, [0, 2]] / RADIUS_M  # the cosine to either view's axis
+    own, other = seen[np.arange(len(seen)), squares.view_of], seen[np.arange(len(seen)), 1 - squares.view_of]
+    between = (seen > 0.35).all(axis=1)  # both views have it, away from their outlines
+    assert redundant[between & (own < other - 0.05)].mean() > 0.99
+    assert redundant[own > other + 0.05].mean() < 0.01
+    assert redundant[other < 0].sum() == 0
+
+
+def test_views_that_disagree_meet_between() -> None:
+    views = [ball_view(eye, 100) for eye in RING[:2]]
+    for index, off_mm in enumerate((6, -6)):
+        depth = views[index].depth_mm.astype(np.int64)
+        views[index] = replace(views[index], depth_mm=np.where(depth > 0, depth + off_mm, 0).astype(np.uint16))
+    _, vertices, _, consensus = views_overlap(views)
+    middle = (np.abs(vertices[:, 0] - vertices[:, 2]) < 0.05) & (vertices[:, 0] > 0.3)
+    before, after = (np.abs(np.linalg.norm(v[middle], axis=1) - RADIUS_M) for v in (vertices, consensus))
+    assert before.mean() > 0.003
+    assert after.mean() < 0.3 * before.mean()
 
 
 @cache

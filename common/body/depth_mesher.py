@@ -12,8 +12,6 @@ from numba import njit
 from numpy.typing import NDArray
 
 from common.body.view import View
-from common.geometry.camera_model import Camera
-from common.geometry.rigid_transform import transform_points
 from common.geometry.triangle_mesh import TriangleMesh
 
 SMOOTHING_RADIUS_PIXELS = 2
@@ -21,6 +19,7 @@ SMOOTHING_RANGE_MM = 50.0  # depths further apart belong to different surfaces; 
 # A pixel is an area: the person goes on beyond the middle of the outermost ones. Measured: 0.3 gives the best
 # silhouettes and pictures, 0.5 carries surfaces that turn away too far out.
 OUTLINE_PIXELS = 0.3
+_BAND_ROWS = 8
 
 
 def mesh_view(view: View, stride: int = 1) -> TriangleMesh:
@@ -36,12 +35,9 @@ def mesh_view(view: View, stride: int = 1) -> TriangleMesh:
     if stride < 1:
         raise ValueError(f"stride {stride} is below 1")
     depth = smooth_depth(view.depth_mm, SMOOTHING_RADIUS_PIXELS, SMOOTHING_RANGE_MM)
-    index, grid_depth, pixels = _grid_vertices(depth, stride, np.float32(OUTLINE_PIXELS))
-    rays = _rays(view.camera, pixels + np.array([view.u0, view.v0], np.float32))
-    depths_m = grid_depth[index >= 0] * np.float32(1e-3)
-    vertices = transform_points(view.camera.T_world_camera, rays * depths_m[:, None])
-    size = np.array(depth.shape[::-1], np.float32)
-    uv = (np.clip(pixels, 0, size - 1) + np.float32(0.5)) / size
+    index, grid_depth, pixels, depths_mm = _grid_vertices(depth, stride, np.float32(OUTLINE_PIXELS))
+    to_world, ideal = _to_world(view), _undistorted(view, pixels)
+    vertices, uv = _placed(pixels, ideal, depths_mm, to_world, *depth.shape)
     return TriangleMesh(vertices, _grid_faces(grid_depth, index), uv, view.colour)
 
 
@@ -55,60 +51,93 @@ def smooth_depth(depth_mm: NDArray[np.uint16], radius: int, range_mm: float) -> 
     return _smooth(depth_mm, radius, np.float32(range_mm))
 
 
-def _rays(camera: Camera, pixels: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Viewing rays (V, 3) float32, camera frame, z = 1, of pixels (V, 2)."""
-    rays = np.ones((len(pixels), 3), np.float32)
-    if camera.distortion.any() and len(pixels):
-        undistorted = cv2.undistortPoints(pixels.reshape(-1, 1, 2), camera.matrix, camera.distortion)
-        rays[:, :2] = undistorted.reshape(-1, 2)
-    else:
-        centre, focal = np.array([camera.cx, camera.cy]), np.array([camera.fx, camera.fy])
-        rays[:, :2] = (pixels - centre) / focal
-    return rays
+def _to_world(view: View) -> NDArray[np.float32]:
+    """Rows (3, 4): a pixel (column, row, 1) of the crop, times its depth, and 1 → world [m, for depths in mm]."""
+    camera = view.camera
+    rays = np.array(
+        [
+            [1 / camera.fx, 0, (view.u0 - camera.cx) / camera.fx],
+            [0, 1 / camera.fy, (view.v0 - camera.cy) / camera.fy],
+            [0, 0, 1],
+        ]
+    )
+    T = camera.T_world_camera[:3]
+    return np.concatenate([1e-3 * T[:, :3] @ rays, T[:, 3:]], axis=1).astype(np.float32)
+
+
+def _undistorted(view: View, pixels: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Where pixels (V, 2) of the crop would be without the camera's distortion."""
+    camera = view.camera
+    if not camera.distortion.any() or not len(pixels):
+        return pixels
+    corner = np.array([view.u0, view.v0], np.float32)
+    K = camera.matrix
+    straight = cv2.undistortPoints((pixels + corner).reshape(-1, 1, 2), K, camera.distortion, P=K)
+    return straight.reshape(-1, 2).astype(np.float32) - corner
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _placed(pixels, ideal, depths_mm, to_world, height, width):  # type: ignore[no-untyped-def]
+    """Vertices (V, 3) [m, world] and texture coordinates (V, 2) of pixels (V, 2), without distortion at ``ideal``."""
+    vertices, uv = np.empty((len(pixels), 3), np.float32), np.empty_like(pixels)
+    right, bottom, half = np.float32(width - 1), np.float32(height - 1), np.float32(0.5)
+    for v in range(len(pixels)):
+        z = depths_mm[v]
+        x, y = ideal[v, 0] * z, ideal[v, 1] * z
+        for i in range(3):
+            vertices[v, i] = to_world[i, 0] * x + to_world[i, 1] * y + to_world[i, 2] * z + to_world[i, 3]
+        uv[v, 0] = (min(max(pixels[v, 0], np.float32(0)), right) + half) / np.float32(width)
+        uv[v, 1] = (min(max(pixels[v, 1], np.float32(0)), bottom) + half) / np.float32(height)
+    return vertices, uv
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
 def _smooth(depth_mm, radius, range_mm):  # type: ignore[no-untyped-def]
-    """Row by row and pair by pair: the innermost loop, over the columns, is one the compiler can vectorise."""
+    """Band by band, which the cache holds, and pair by pair: the innermost loop, over a band as one row, is one
+    the compiler can vectorise. A margin of background keeps what is added beyond an edge from counting."""
     h, w = depth_mm.shape
-    depth = depth_mm.astype(np.float32)
-    out = np.zeros((h, w), np.float32)
-    count = np.empty(w, np.float32)
-    for y in range(h):
-        centre, total = depth[y], out[y]
+    columns, above_all = w + 2 * radius, radius + 1
+    padded = np.zeros((h + 2 * above_all, columns), np.float32)
+    padded[above_all : above_all + h, radius : radius + w] = depth_mm
+    depth, out = padded.ravel(), np.zeros((h, w), np.float32)
+    totals, counts = np.empty(_BAND_ROWS * columns, np.float32), np.empty(_BAND_ROWS * columns, np.float32)
+    for top in range(0, h, _BAND_ROWS):
+        rows = min(_BAND_ROWS, h - top)
+        start, end = (top + above_all) * columns, (top + above_all + rows) * columns
+        centre, total, count = depth[start:end], totals[: end - start], counts[: end - start]
         total[:] = centre
         count[:] = np.float32(1.0)
-        for j in range(min(radius, y, h - 1 - y) + 1):
-            above, below = depth[y - j], depth[y + j]
+        for j in range(radius + 1):
             for i in range(-radius if j > 0 else 1, radius + 1):
-                m = abs(i)
+                off = j * columns + i
                 _add_pairs(
-                    centre[m : w - m], above[m - i : w - m - i], below[m + i : w - m + i], range_mm,
-                    total[m : w - m], count[m : w - m],
-                )  # fmt: skip
-        for x in range(w):
-            total[x] = total[x] / count[x] if centre[x] > 0 else np.float32(0.0)
+                    centre, depth[start - off : end - off], depth[start + off : end + off], range_mm, total, count
+                )
+        for p in range(end - start):
+            total[p] = total[p] / count[p] if centre[p] > 0 else np.float32(0.0)
+        out[top : top + rows] = total.reshape(rows, columns)[:, radius : radius + w]
     return out
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
 def _add_pairs(centre, above, below, range_mm, total, count):  # type: ignore[no-untyped-def]
-    """A row's pairs of one direction, each added to the pixel between if it is near; the background, 0, never is."""
-    for x in range(len(centre)):
-        z, a, b = centre[x], above[x], below[x]
-        near = (abs(a - z) <= range_mm) & (abs(b - z) <= range_mm) & (abs(a + b - 2 * z) <= range_mm)
-        total[x] += a + b if near else np.float32(0.0)
-        count[x] += np.float32(2.0) if near else np.float32(0.0)
+    """Pairs of one direction, each added to the pixel between if it is near; the background, 0, never is."""
+    for p in range(len(centre)):
+        z, a, b = centre[p], above[p], below[p]
+        near = (abs(a - z) <= range_mm) & (abs(b - z) <= range_mm) & (abs(a + b - np.float32(2.0) * z) <= range_mm)
+        total[p] += a + b if near else np.float32(0.0)
+        count[p] += np.float32(2.0) if near else np.float32(0.0)
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
 def _grid_vertices(depth, stride, outline):  # type: ignore[no-untyped-def]
-    """Per square its vertex number (-1 = none) and depth; per vertex its column and row, moved out by ``outline``."""
+    """Per square its vertex number (-1 = none) and depth; per vertex its column and row, moved out by ``outline``, and
+    its depth."""
     rows, columns = (depth.shape[0] + stride - 1) // stride, (depth.shape[1] + stride - 1) // stride
     covered = _covered_squares(depth, stride, rows, columns)
     index = np.full((rows, columns), -1, np.int32)
     grid_depth = np.zeros((rows, columns), np.float32)
-    pixels = np.empty((rows * columns, 2), np.float32)
+    pixels, depths = np.empty((rows * columns, 2), np.float32), np.empty(rows * columns, np.float32)
     count = 0
     for r in range(rows):
         for c in range(columns):
@@ -118,20 +147,25 @@ def _grid_vertices(depth, stride, outline):  # type: ignore[no-untyped-def]
             down = np.int64(covered[r, c + 1]) - np.int64(covered[r + 2, c + 1])
             y, x = _outermost(depth, r * stride, c * stride, stride, down, right)
             pixels[count, 0], pixels[count, 1] = x + outline * right, y + outline * down
-            grid_depth[r, c] = depth[y, x]
+            grid_depth[r, c] = depths[count] = depth[y, x]
             index[r, c] = count
             count += 1
-    return index, grid_depth, pixels[:count].copy()
+    return index, grid_depth, pixels[:count].copy(), depths[:count].copy()
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
 def _covered_squares(depth, stride, rows, columns):  # type: ignore[no-untyped-def]
     """Whether a square holds foreground, with a border of squares that do not."""
     covered = np.zeros((rows + 2, columns + 2), np.bool_)
-    for y in range(depth.shape[0]):
-        for x in range(depth.shape[1]):
-            if depth[y, x] > 0:
-                covered[y // stride + 1, x // stride + 1] = True
+    deepest = np.empty(columns * stride, np.float32)
+    for r in range(rows):
+        deepest[:] = 0
+        for y in range(r * stride, min((r + 1) * stride, depth.shape[0])):
+            for x in range(depth.shape[1]):
+                deepest[x] = max(deepest[x], depth[y, x])
+        for c in range(columns):
+            for x in range(c * stride, (c + 1) * stride):
+                covered[r + 1, c + 1] |= deepest[x] > 0
     return covered
 
 
@@ -140,6 +174,8 @@ def _outermost(depth, top, left, stride, down, right):  # type: ignore[no-untype
     """Row and column of a covered square's foreground pixel that is furthest ``down`` and ``right`` (1, 0 or -1)."""
     found = top, left
     furthest = -4 * stride
+    if down == 0 and right == 0 and depth[top, left] > 0:
+        return found
     for y in range(top, min(top + stride, depth.shape[0])):
         for x in range(left, min(left + stride, depth.shape[1])):
             if depth[y, x] > 0 and down * (y - top) + right * (x - left) > furthest:

@@ -55,26 +55,16 @@ def joint_edges(
     ``vertices`` (V, 3) [m, world], ``faces`` (F, 3), in which a place has one number also along seams;
     ``vertex_region`` (V,) uint8 (``vertex_regions``), ``T_link_world`` (L, 4, 4): as in ``RiggedMesh``.
     """
-    count = len(vertices)
-    keys = np.unique(_joining_edge_keys(faces, vertex_region, REGION_LINKS))
-    pair, ends = np.divmod(keys, count * count)
-    ends = np.stack(np.divmod(ends, count), axis=1).astype(np.int32)
-    starts = np.flatnonzero(np.diff(pair, prepend=-1))
-    regions = np.stack(np.divmod(pair, REGION_COUNT), axis=1).astype(np.uint8)
-    links = REGION_LINKS[regions]
-    a, b = (
-        np.einsum("eij,ej->ei", T_link_world[links[:, k], :3, :3], vertices[ends[:, k]])
-        + T_link_world[links[:, k], :3, 3]
-        for k in (0, 1)
-    )
-    lengths = np.linalg.norm(vertices[ends[:, 0]] - vertices[ends[:, 1]], axis=1)
+    keys = np.sort(_joining_edge_keys(faces, vertex_region, REGION_LINKS))
+    ends, regions, points, lengths = _edges(keys, vertices, REGION_LINKS, T_link_world)
+    starts = np.flatnonzero((np.diff(regions, axis=0, prepend=np.uint8(REGION_COUNT)) != 0).any(axis=1))
     return JointEdges(
         vertices=ends,
-        points=np.ascontiguousarray(np.concatenate([a, b], axis=1).T, np.float32),
-        rest_lengths=lengths.astype(np.float32),
+        points=points,
+        rest_lengths=lengths,
         pair_regions=np.ascontiguousarray(regions[starts]),
-        pair_links=np.ascontiguousarray(links[starts]),
-        pair_starts=np.append(starts, len(keys)).astype(np.int32),
+        pair_links=np.ascontiguousarray(REGION_LINKS[regions[starts]]),
+        pair_starts=np.append(starts, len(ends)).astype(np.int32),
         region_lengths=_region_lengths(vertices, faces, vertex_region, regions, lengths, score_form),
     )
 
@@ -114,6 +104,30 @@ def _joining_edge_keys(faces, vertex_region, region_links):  # type: ignore[no-u
             keys[count] = (pair * vertex_count + a) * vertex_count + b
             count += 1
     return keys[:count].copy()
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _edges(keys, vertices, region_links, T_link_world):  # type: ignore[no-untyped-def]
+    """What sorted keys stand for, each once: ends (E, 2), regions (E, 2), ``points`` (6, E) and lengths (E,)."""
+    single = np.empty(len(keys), np.bool_)
+    for n in range(len(keys)):
+        single[n] = n == 0 or keys[n] != keys[n - 1]
+    keys = keys[single]
+    ends, regions = np.empty((len(keys), 2), np.int32), np.empty((len(keys), 2), np.uint8)
+    points, lengths = np.empty((6, len(keys)), np.float32), np.empty(len(keys), np.float32)
+    for e in range(len(keys)):
+        pair, both = divmod(keys[e], len(vertices) * len(vertices))
+        ends[e, 0], ends[e, 1] = divmod(both, len(vertices))
+        regions[e, 0], regions[e, 1] = divmod(pair, len(region_links))
+        squared = np.float32(0.0)
+        for i in range(3):
+            step = vertices[ends[e, 0], i] - vertices[ends[e, 1], i]
+            squared += step * step
+            for k in range(2):
+                T, v = T_link_world[region_links[regions[e, k]]], vertices[ends[e, k]]
+                points[3 * k + i, e] = T[i, 0] * v[0] + T[i, 1] * v[1] + T[i, 2] * v[2] + T[i, 3]
+        lengths[e] = np.sqrt(squared)
+    return ends, regions, points, lengths
 
 
 @njit(nogil=True, cache=True, error_model="numpy")

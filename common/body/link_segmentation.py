@@ -11,6 +11,7 @@ from common.body.skeleton_pose import bone_segments
 
 FLESH_M = 0.02  # cloth and flesh beyond the cylinder: without it a thick link claims its thin neighbours' surface
 CAP_M = 0.05  # a cylinder's reach beyond its ends: with the torso's own radius it would claim neck and jaw
+_BLOCK = 1024  # vertices
 
 
 def nearest_link(
@@ -37,18 +38,32 @@ def bone_metric(skeleton: Skeleton, T_world_link: NDArray[np.float32]) -> tuple[
 
 @njit(nogil=True, cache=True, error_model="numpy")
 def _nearest(vertices, starts, axes, lengths, per_thickness_squared, per_cap_squared):  # type: ignore[no-untyped-def]
-    links = np.empty(len(vertices), np.uint8)
-    for v in range(len(vertices)):
-        best = np.float32(np.inf)
+    """Block by block, which the cache holds, and link by link: the innermost loop is one the compiler can vectorise."""
+    links = np.zeros(len(vertices), np.uint8)
+    points, best = np.empty((3, _BLOCK), np.float32), np.empty(_BLOCK, np.float32)
+    for first in range(0, len(vertices), _BLOCK):
+        block = links[first : first + _BLOCK]
+        for i in range(3):
+            points[i, : len(block)] = vertices[first : first + _BLOCK, i]
+        best[:] = np.inf
+        x, y, z = points[0, : len(block)], points[1, : len(block)], points[2, : len(block)]
         for link in range(len(starts)):
-            x = vertices[v, 0] - starts[link, 0]
-            y = vertices[v, 1] - starts[link, 1]
-            z = vertices[v, 2] - starts[link, 2]
-            along = x * axes[link, 0] + y * axes[link, 1] + z * axes[link, 2]
-            across_squared = x * x + y * y + z * z - along * along
-            beyond = max(-along, along - lengths[link], np.float32(0.0))
-            distance = across_squared * per_thickness_squared[link] + beyond * beyond * per_cap_squared[link]
-            if distance < best:
-                best = distance
-                links[v] = link
+            bone = starts[link], axes[link], lengths[link], per_thickness_squared[link], per_cap_squared[link]
+            _take_nearer(x, y, z, np.uint8(link), bone, best[: len(block)], block)
     return links
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _take_nearer(xs, ys, zs, link, bone, best, links):  # type: ignore[no-untyped-def]
+    """Enter a link where it is nearer than the best so far, and its distance."""
+    start, axis, length, per_thickness_squared, per_cap_squared = bone
+    sx, sy, sz, ax, ay, az = start[0], start[1], start[2], axis[0], axis[1], axis[2]
+    for v in range(len(links)):
+        x, y, z = xs[v] - sx, ys[v] - sy, zs[v] - sz
+        along = x * ax + y * ay + z * az
+        across_squared = x * x + y * y + z * z - along * along
+        beyond = max(-along, along - length, np.float32(0.0))
+        distance = across_squared * per_thickness_squared + beyond * beyond * per_cap_squared
+        nearer = distance < best[v]
+        best[v] = distance if nearer else best[v]
+        links[v] = link if nearer else links[v]

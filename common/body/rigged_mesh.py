@@ -131,42 +131,43 @@ def build_rigged_mesh(
 
 def merged(meshes: Sequence[TriangleMesh]) -> TriangleMesh:
     """One mesh of one or more, their surfaces unconnected, their textures side by side in one atlas."""
-    first = np.cumsum([0, *(len(m.vertices) for m in meshes[:-1])], dtype=np.int32)
-    lefts = np.cumsum([0, *(m.texture.shape[1] for m in meshes[:-1])])
     height, width = max(m.texture.shape[0] for m in meshes), sum(m.texture.shape[1] for m in meshes)
     atlas = np.empty((height, width, 3), np.uint8)
-    size = np.array([width, height], np.float32)
-    uv = []
-    for m, left in zip(meshes, lefts, strict=True):
+    vertices = np.concatenate([m.vertices for m in meshes])
+    faces, uv = np.concatenate([m.faces for m in meshes]), np.concatenate([m.uv for m in meshes])
+    vertex = face = left = 0
+    for m in meshes:
         h, w = m.texture.shape[:2]
         atlas[:h, left : left + w] = m.texture
         atlas[h:, left : left + w] = m.texture[-1]  # below it goes on: a step would ring in a JPEG
-        uv.append((m.uv * np.array([w, h], np.float32) + np.array([left, 0], np.float32)) / size)
-    return TriangleMesh(
-        np.concatenate([m.vertices for m in meshes]),
-        np.concatenate([m.faces + offset for m, offset in zip(meshes, first, strict=True)]),
-        np.concatenate(uv),
-        atlas,
-    )
+        faces[face : face + len(m.faces)] += np.int32(vertex)
+        u, v = uv[vertex : vertex + len(m.uv)].T
+        u[:] = (u * np.float32(w) + np.float32(left)) / np.float32(width)
+        v *= np.float32(h / height)
+        vertex, face, left = vertex + len(m.uv), face + len(m.faces), left + w
+    return TriangleMesh(vertices, faces, uv, atlas)
 
 
 def _drawn_first(mesh: TriangleMesh, vertex_link: NDArray[np.uint8]) -> tuple[TriangleMesh, int]:
     """The mesh with its drawn triangles in front, and their number: what is drawn is then a slice, not a copy."""
-    drawn = _drawn(mesh.vertices, mesh.faces, vertex_link, _LINK_STEPS <= DRAWN_LINK_STEPS, np.float32(DRAWN_EDGE_M**2))
-    faces = np.concatenate([mesh.faces[drawn], mesh.faces[~drawn]])
-    return TriangleMesh(mesh.vertices, faces, mesh.uv, mesh.texture), int(np.count_nonzero(drawn))
+    linked = _LINK_STEPS <= DRAWN_LINK_STEPS
+    faces, count = _sorted(mesh.vertices, mesh.faces, vertex_link, linked, np.float32(DRAWN_EDGE_M**2))
+    return TriangleMesh(mesh.vertices, faces, mesh.uv, mesh.texture), count
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
-def _drawn(vertices, faces, vertex_link, linked, longest_squared):  # type: ignore[no-untyped-def]
-    """Mask (F,) of the triangles whose edges are short and join links of one limb."""
-    out = np.ones(len(faces), np.bool_)
+def _sorted(vertices, faces, vertex_link, linked, longest_squared):  # type: ignore[no-untyped-def]
+    """The triangles (F, 3), those in front whose edges are short and join links of one limb; and how many these are."""
+    out = np.empty_like(faces)
+    front, back = 0, len(faces)
     for f in range(len(faces)):
-        for k in range(3):
-            a, b = faces[f, k], faces[f, (k + 1) % 3]
-            x = vertices[a, 0] - vertices[b, 0]
-            y = vertices[a, 1] - vertices[b, 1]
-            z = vertices[a, 2] - vertices[b, 2]
-            if x * x + y * y + z * z > longest_squared or not linked[vertex_link[a], vertex_link[b]]:
-                out[f] = False
-    return out
+        a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
+        drawn = True
+        for p, q in ((a, b), (b, c), (c, a)):
+            x, y, z = vertices[p, 0] - vertices[q, 0], vertices[p, 1] - vertices[q, 1], vertices[p, 2] - vertices[q, 2]
+            drawn &= x * x + y * y + z * z <= longest_squared and linked[vertex_link[p], vertex_link[q]]
+        back -= not drawn
+        place = front if drawn else back
+        out[place, 0], out[place, 1], out[place, 2] = a, b, c
+        front += drawn
+    return out, front

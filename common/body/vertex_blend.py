@@ -40,11 +40,16 @@ def vertex_blend(
     return VertexBlend(other, share, np.where(_PARENTS[vertex_link] == other, vertex_link, other).astype(np.uint8))
 
 
-def _neighbours() -> NDArray[np.bool_]:
-    joined = np.zeros((LINK_COUNT, LINK_COUNT), np.bool_)
+def _neighbours() -> NDArray[np.int64]:
+    """The links joined to each (L, N), in order; -1 beyond the last."""
+    joined: list[list[int]] = [[] for _ in range(LINK_COUNT)]
     for link, parent in enumerate(LINK_PARENTS[1:], start=1):
-        joined[link, parent] = joined[parent, link] = True
-    return joined
+        joined[link].append(parent)
+        joined[parent].append(link)
+    out = np.full((LINK_COUNT, max(map(len, joined))), -1)
+    for link, others in enumerate(joined):
+        out[link, : len(others)] = sorted(others)
+    return out
 
 
 _NEIGHBOURS, _PARENTS = _neighbours(), np.array(LINK_PARENTS)
@@ -55,22 +60,26 @@ def _blend(vertices, own, neighbours, band, metric):  # type: ignore[no-untyped-
     starts, axes, lengths, per_thickness2, per_cap2 = metric
     other, share = np.empty(len(vertices), np.uint8), np.empty(len(vertices), np.uint8)
     for v in range(len(vertices)):
-        nearest, mine = np.float32(np.inf), np.float32(0.0)
-        for link in range(len(starts)):
-            if link != own[v] and not neighbours[own[v], link]:
-                continue
-            x = vertices[v, 0] - starts[link, 0]
-            y = vertices[v, 1] - starts[link, 1]
-            z = vertices[v, 2] - starts[link, 2]
-            along = x * axes[link, 0] + y * axes[link, 1] + z * axes[link, 2]
-            across = max(x * x + y * y + z * z - along * along, np.float32(0.0))
-            beyond = max(-along, along - lengths[link], np.float32(0.0))
-            distance = np.sqrt(across * per_thickness2[link] + beyond * beyond * per_cap2[link])
-            if link == own[v]:
-                mine = distance
-            elif distance < nearest:
+        x, y, z = vertices[v, 0], vertices[v, 1], vertices[v, 2]
+        mine = _distance(x, y, z, np.int64(own[v]), starts, axes, lengths, per_thickness2, per_cap2)
+        nearest = np.float32(np.inf)
+        for link in neighbours[own[v]]:
+            if link < 0:
+                break
+            distance = _distance(x, y, z, link, starts, axes, lengths, per_thickness2, per_cap2)
+            if distance < nearest:
                 nearest = distance
                 other[v] = link
         t = min(max((nearest - mine) / band, np.float32(0.0)), np.float32(1.0))
         share[v] = np.uint8(np.float32(127.0) * (1 - t * t * (3 - 2 * t)))
     return other, share
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _distance(x, y, z, link, starts, axes, lengths, per_thickness2, per_cap2):  # type: ignore[no-untyped-def]
+    """Distance to a bone in its thicknesses (``bone_metric``)."""
+    x, y, z = x - starts[link, 0], y - starts[link, 1], z - starts[link, 2]
+    along = x * axes[link, 0] + y * axes[link, 1] + z * axes[link, 2]
+    across = max(x * x + y * y + z * z - along * along, np.float32(0.0))
+    beyond = max(-along, along - lengths[link], np.float32(0.0))
+    return np.sqrt(across * per_thickness2[link] + beyond * beyond * per_cap2[link])

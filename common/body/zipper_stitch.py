@@ -10,9 +10,14 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from common.body.edge_table import edge_table, known, remember
+
 EAR_SQUARES = (1.5, 2.5, 5.0)  # the longest third edge, in squares of the mesh: short ears first
 _ROUNDS = 6
 _EMPTY = -1
+# Rows of the open edges (5, E) int32: from vertex to vertex (from none: closed), the view it is of (none: an ear's),
+# and as chains the next edge from the same vertex, and to the same vertex.
+_FROM, _TO, _VIEW, _NEXT_FROM, _NEXT_TO = range(5)
 
 
 def stitched(
@@ -39,38 +44,26 @@ def stitched(
 
 @njit(nogil=True, cache=True, error_model="numpy")
 def _stitch(vertices, normals, faces, leader, view_of, border, size_m, limits, views):  # type: ignore[no-untyped-def]
-    start, end, view, count, table = _open_edges(faces, leader, view_of, border)
-    out_first, out_next = _chains(start, count, len(vertices))
-    in_first, in_next = _chains(end, count, len(vertices))
-    edges = start, end, view, out_first, out_next, in_first, in_next
-    corners = np.unique(start[:count])
-    ears = np.empty((len(start), 4), np.int32)  # the corners, and the view to paint it
+    edges, first, count, table = _open_edges(faces, leader, view_of, border)
+    corners = np.unique(edges[_FROM, :count])
+    ears = np.empty((edges.shape[1], 4), np.int32)  # the corners, and the view to paint it
     ear_count = 0
     ear = np.empty(3, np.int64)  # edges in, out and closing
+    untried = np.empty(len(vertices), np.bool_)  # corners at which something changed since no ear was found there
     for limit in limits:
+        untried[:] = True
         for _ in range(_ROUNDS):
             before = ear_count
             for p in corners:
-                while _best_ear(p, limit, vertices, normals, size_m, edges, table, ear):
-                    if count + 1 >= len(start):
+                while untried[p]:
+                    untried[p] = _best_ear(p, limit, vertices, normals, size_m, edges, first, table, ear)
+                    if not untried[p] or count + 1 >= edges.shape[1]:
                         break
-                    u, w = start[ear[0]], end[ear[1]]
-                    paint = max(view[ear[0]], view[ear[1]])
-                    ears[ear_count, 0], ears[ear_count, 1], ears[ear_count, 2] = u, w, p
-                    ears[ear_count, 3] = paint if paint >= 0 else view_of[p]
+                    paint = max(edges[_VIEW, ear[0]], edges[_VIEW, ear[1]])
+                    ears[ear_count, 0], ears[ear_count, 1] = edges[_FROM, ear[0]], edges[_TO, ear[1]]
+                    ears[ear_count, 2], ears[ear_count, 3] = p, paint if paint >= 0 else view_of[p]
                     ear_count += 1
-                    _remember(table, w, p)
-                    _remember(table, p, u)
-                    start[ear[0]] = start[ear[1]] = _EMPTY
-                    if ear[2] >= 0:
-                        start[ear[2]] = _EMPTY
-                        _remember(table, u, w)
-                    else:
-                        start[count], end[count], view[count] = u, w, _EMPTY
-                        out_next[count], in_next[count] = out_first[u], in_first[w]
-                        out_first[u] = in_first[w] = count
-                        count += 1
-                        _remember(table, u, w)
+                    count = _close(p, ear, edges, first, count, table, untried)
             if ear_count == before:
                 break
     return _painted(ears[:ear_count], leader, view_of, views)
@@ -78,83 +71,88 @@ def _stitch(vertices, normals, faces, leader, view_of, border, size_m, limits, v
 
 @njit(nogil=True, cache=True, error_model="numpy")
 def _open_edges(faces, leader, view_of, border):  # type: ignore[no-untyped-def]
-    """Edges of one triangle only, as it goes along them: start, end, its view (with room for new ones), their number;
-    and the table of all edges between border vertices."""
+    """Edges of one triangle only, as it goes along them (with room for new ones), the first of those from and to each
+    vertex (2, V), their number; and the table of all edges between border vertices."""
+    at_border = border[leader]
     total = 0
     for f in range(len(faces)):
-        for k in range(3):
-            total += border[leader[faces[f, k]]] and border[leader[faces[f, (k + 1) % 3]]]
-    size = 1
-    while size < 8 * total + 64:
-        size *= 2
-    table = np.full((size, 2), _EMPTY, np.int32)
+        total += int(at_border[faces[f, 0]]) + int(at_border[faces[f, 1]]) + int(at_border[faces[f, 2]]) >= 2
+    found, table = np.empty((3, 3 * total), np.int32), edge_table(4 * total)
+    n = 0
     for f in range(len(faces)):
         for k in range(3):
-            a, b = leader[faces[f, k]], leader[faces[f, (k + 1) % 3]]
-            if border[a] and border[b]:
-                _remember(table, a, b)
-    start, end = np.empty(2 * total + 8, np.int32), np.empty(2 * total + 8, np.int32)
-    view = np.empty(2 * total + 8, np.int32)
+            a, b = faces[f, k], faces[f, (k + 1) % 3]
+            if at_border[a] and at_border[b]:
+                found[0, n], found[1, n], found[2, n] = leader[a], leader[b], view_of[faces[f, 0]]
+                remember(table, leader[a], leader[b])
+                n += 1
+    edges, first = np.empty((5, 2 * n + 8), np.int32), np.full((2, len(leader)), _EMPTY, np.int32)
     count = 0
-    for f in range(len(faces)):
-        for k in range(3):
-            a, b = leader[faces[f, k]], leader[faces[f, (k + 1) % 3]]
-            if border[a] and border[b] and not _known(table, b, a):
-                start[count], end[count], view[count] = a, b, view_of[faces[f, 0]]
-                count += 1
-    return start, end, view, count, table
+    for e in range(n):
+        if not known(table, found[1, e], found[0, e]):
+            count = _add(found[0, e], found[1, e], found[2, e], edges, first, count)
+    return edges, first, count, table
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
-def _chains(vertex, count, vertices):  # type: ignore[no-untyped-def]
-    """The edges at each vertex as chains: the first of each vertex, and the one after each edge."""
-    first, following = np.full(vertices, _EMPTY, np.int32), np.full(len(vertex), _EMPTY, np.int32)
-    for e in range(count):
-        following[e] = first[vertex[e]]
-        first[vertex[e]] = e
-    return first, following
+def _add(a, b, view, edges, first, count):  # type: ignore[no-untyped-def]
+    """One more open edge, a → b; returns how many there are."""
+    edges[_FROM, count], edges[_TO, count], edges[_VIEW, count] = a, b, view
+    edges[_NEXT_FROM, count], edges[_NEXT_TO, count] = first[0, a], first[1, b]
+    first[0, a] = first[1, b] = count
+    return count + 1
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
-def _best_ear(p, limit, vertices, normals, size_m, edges, table, ear):  # type: ignore[no-untyped-def]
+def _close(p, ear, edges, first, count, table, untried):  # type: ignore[no-untyped-def]
+    """The ear at corner p closes its two edges, and the third or opens it; returns how many edges there are."""
+    u, w = edges[_FROM, ear[0]], edges[_TO, ear[1]]
+    remember(table, w, p)
+    remember(table, p, u)
+    remember(table, u, w)
+    edges[_FROM, ear[0]] = edges[_FROM, ear[1]] = _EMPTY
+    if ear[2] >= 0:
+        edges[_FROM, ear[2]] = _EMPTY
+        return count
+    untried[u] = untried[w] = True
+    e = first[0, w]
+    while e >= 0:  # a hole of three edges may be left, u → w → here
+        untried[edges[_TO, e]] = True
+        e = edges[_NEXT_FROM, e]
+    return _add(u, w, _EMPTY, edges, first, count)
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _best_ear(p, limit, vertices, normals, size_m, edges, first, table, ear):  # type: ignore[no-untyped-def]
     """Whether there is an ear at corner p, and into ``ear`` the one with the shortest third edge."""
-    start, end, view, out_first, out_next, in_first, in_next = edges
     shortest = (limit * size_m[p]) ** 2
     found = False
-    e = in_first[p]
+    e = first[1, p]
     while e >= 0:
-        o = out_first[p] if start[e] >= 0 else _EMPTY
+        u = edges[_FROM, e]
+        o = first[0, p] if u >= 0 else _EMPTY
         while o >= 0:
-            if start[o] >= 0:
-                u, w = start[e], end[o]
-                closing = _open_between(w, u, start, end, out_first, out_next)
-                joins = view[e] != view[o] or view[e] < 0 or closing >= 0
-                squared = _squared(vertices, u, w)
-                new = not (_known(table, w, p) or _known(table, p, u) or (closing < 0 and _known(table, u, w)))
-                if (
-                    joins
-                    and new
-                    and u != w
-                    and squared < shortest
-                    and (closing >= 0 or _faces_out(vertices, normals, u, w, p))
-                ):
-                    shortest = squared
+            w = edges[_TO, o]
+            if edges[_FROM, o] >= 0 and u != w and _squared(vertices, u, w) < shortest:
+                closing = _open_between(w, u, edges, first)
+                joins = edges[_VIEW, e] != edges[_VIEW, o] or edges[_VIEW, e] < 0
+                fits = closing >= 0 or (joins and not known(table, u, w) and _faces_out(vertices, normals, u, w, p))
+                if fits and not known(table, w, p) and not known(table, p, u):
+                    shortest = _squared(vertices, u, w)
                     ear[0], ear[1], ear[2] = e, o, closing
                     found = True
-            o = out_next[o]
-        e = in_next[e]
+            o = edges[_NEXT_FROM, o]
+        e = edges[_NEXT_TO, e]
     return found
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
-def _open_between(a, b, start, end, out_first, out_next):  # type: ignore[no-untyped-def]
+def _open_between(a, b, edges, first):  # type: ignore[no-untyped-def]
     """The open edge from a to b, -1 if none."""
-    e = out_first[a]
-    while e >= 0:
-        if start[e] >= 0 and end[e] == b:
-            return e
-        e = out_next[e]
-    return np.int32(_EMPTY)
+    e = first[0, a]
+    while e >= 0 and (edges[_FROM, e] < 0 or edges[_TO, e] != b):
+        e = edges[_NEXT_FROM, e]
+    return e
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
@@ -173,30 +171,6 @@ def _faces_out(vertices, normals, a, b, c):  # type: ignore[no-untyped-def]
         n -= (vertices[b, k] - vertices[a, k]) * (vertices[c, j] - vertices[a, j])
         total += n * (normals[a, i] + normals[b, i] + normals[c, i])
     return total > 0
-
-
-@njit(nogil=True, cache=True, error_model="numpy")
-def _remember(table, a, b):  # type: ignore[no-untyped-def]
-    """Enter the edge a → b into the open-addressed table."""
-    mask = len(table) - 1
-    place = (np.int64(a) * 73856093 + np.int64(b) * 19349663) & mask
-    while table[place, 0] != _EMPTY:
-        if table[place, 0] == a and table[place, 1] == b:
-            return
-        place = (place + 1) & mask
-    table[place, 0], table[place, 1] = a, b
-
-
-@njit(nogil=True, cache=True, error_model="numpy")
-def _known(table, a, b):  # type: ignore[no-untyped-def]
-    """Whether the edge a → b is in the table."""
-    mask = len(table) - 1
-    place = (np.int64(a) * 73856093 + np.int64(b) * 19349663) & mask
-    while table[place, 0] != _EMPTY:
-        if table[place, 0] == a and table[place, 1] == b:
-            return True
-        place = (place + 1) & mask
-    return False
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
