@@ -26,8 +26,9 @@ DRAINING = 2.0
 CARRIED, WELL_CARRIED = 0.85, 0.93  # of the skeletons; a path may lose a few by chance
 GIVEN_WAY_BPS = 1.5 * FLOOR_BPS  # bulk that takes less has no more to give way with
 BAD_NS = 1_000_000_000  # so long it must be bad
+SILENCE_NS = 1_500_000_000  # without any skeleton
 SETTLE_NS = 2_000_000_000  # so long a change takes to show, once what waits in the queue has passed
-PATIENCE_NS, PATIENCE_MAX_NS = 10_000_000_000, 160_000_000_000  # so long all must be well before more are tried
+PATIENCE_NS, PATIENCE_MAX_NS = 4_000_000_000, 160_000_000_000  # so long all must be well before more are tried
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,6 +61,7 @@ class LayerSubscription:
         self._forget()
 
     def _forget(self) -> None:
+        self._last = 0, 0.0  # when skeletons came, how long they had queued [s]
         self._heard: deque[_Heard] = deque()
         self._bad_ns: int | None = None
         self._good_ns: int | None = None
@@ -89,22 +91,34 @@ class LayerSubscription:
     def judge(self, lost: int, now_ns: int) -> bool:
         """Every report period: whether ``layers`` has changed. ``lost``: skeletons of the layers taken that did not
         come, since ever."""
-        delay_ns, base_ns = self._delay.take(), self._least_delay.least
-        if delay_ns is None or base_ns is None:
+        queueing_s = self._queueing_s(now_ns)
+        if queueing_s is None:
             return False
-        queueing_s = (delay_ns - base_ns) * NS
         self._heard.append(_Heard(now_ns, self._skeletons, lost, self._bulk_bytes, queueing_s))
         while now_ns - self._heard[0].now_ns > SPAN_NS:
             self._heard.popleft()
         self._weigh(self._heard[0], self._heard[-1])
         return self._decide(now_ns)
 
+    def _queueing_s(self, now_ns: int) -> float | None:
+        """Of the skeletons since the last judgement; None: none came, and there is no telling."""
+        delay_ns, base_ns = self._delay.take(), self._least_delay.least
+        if delay_ns is not None and base_ns is not None:
+            self._last = now_ns, (delay_ns - base_ns) * NS
+            return self._last[1]
+        came_ns, queueing_s = self._last
+        # After a queue the next ones wait, so long at least; after none the path is down.
+        if now_ns - came_ns < SILENCE_NS or queueing_s < FULL_S:
+            return None
+        return queueing_s + (now_ns - came_ns) * NS
+
     def _weigh(self, first: _Heard, now: _Heard) -> None:
         """Since when the path is full, or well used."""
         came, lost = now.skeletons - first.skeletons, now.lost - first.lost
-        if came + lost < LEAST_SENT:
+        silent = now.now_ns - self._last[0] >= SILENCE_NS
+        if came + lost < LEAST_SENT and not silent:
             return
-        carried = came / (came + lost)
+        carried = came / (came + lost) if came else 0.0
         passed_s = (now.now_ns - first.now_ns) * NS
         given_way = (now.bulk_bytes - first.bulk_bytes) * 8 <= GIVEN_WAY_BPS * passed_s
         late = [heard.queueing_s for heard in self._heard if now.now_ns - heard.now_ns <= SPAN_NS / 2]

@@ -135,17 +135,30 @@ def test_each_time_a_layer_was_joined_in_vain_the_next_time_is_later() -> None:
 def test_a_layer_on_trial_goes_at_once_when_a_queue_begins_and_bulk_waits_for_the_verdict() -> None:
     receiver = Thin(4)
     receiver.layers.layers = 3
-    receiver.live(11)
+    receiver.live(PATIENCE_NS / S + 1)
     assert [layers for _, layers in receiver.changes] == [4]
     assert (receiver.layers.divisor, receiver.layers.carried_divisor) == (1, 2)
     receiver.live(3)
     assert receiver.layers.carried_divisor == 1
     short = Thin(3, queue_ms=100, loses=False)  # too short to count but on trial
     short.layers.layers = 3
-    short.live(16)
+    short.live(8)
     (joined, _), (dropped, layers) = short.changes
     assert layers == 3
     assert BAD_NS < dropped - joined < 1.5 * BAD_NS
+
+
+def test_a_queue_that_ends_in_silence_is_a_full_path_and_silence_alone_an_outage() -> None:
+    """TCP on a path that is too thin delivers nothing for seconds, while its timeouts grow."""
+    for queue_ms, changes in ((100, [3]), (0, [])):
+        receiver = Thin(3, queue_ms, loses=False)
+        receiver.live(3)
+        assert receiver.changes == []
+        for step in range(100):
+            now_ns = 3 * S + step * 50 * MS
+            if receiver.layers.judge(0, now_ns):
+                receiver.changes.append((now_ns, receiver.layers.layers))
+        assert [layers for _, layers in receiver.changes] == changes
 
 
 def test_another_run_of_the_sender_has_another_clock_and_the_same_path() -> None:

@@ -18,6 +18,7 @@ from common.wire.receiver_report import ReceiverReport
 NS = 1e-9
 FIRST_WINDOW_BYTES = 16 << 10
 FLOOR_BPS = 100_000
+QUEUE_MAX_S = 0.25  # so deep a queue the floor is kept beside
 CHUNK_LEAST_BYTES = 1200
 CHUNK_HOLDS_S = 0.005  # how long one chunk may hold up a skeleton behind it on the link
 PACING = 1.1  # of the window per round trip: a little more than it allows, so that pacing is not the limit
@@ -329,5 +330,7 @@ class BulkWindow:
 
     @property
     def _least_window(self) -> float:
-        floor = self._settings.floor_bps / 8 * (self._path.round_trip_s + self._period_s)
+        # Beside a deep queue of others the floor is kept, but not by filling one that grows without end.
+        round_trip_s = min(self._path.round_trip_s, self._path.least_round_trip_s + QUEUE_MAX_S)
+        floor = self._settings.floor_bps / 8 * (round_trip_s + self._period_s)
         return max(floor, self.chunk_bytes)
