@@ -97,7 +97,28 @@ def deaf(case: NetworkCase, seen: Seen) -> Figures:
     }
 
 
+def damage(case: NetworkCase, seen: Seen) -> Figures:
+    """Packets are damaged for a while: what of it was shown, what was refused here and below, and how soon all is well
+    after it."""
+    begin_ns, end_ns = seen.changed_ns
+    sent = set(seen.sent.values())
+    after = sorted(shown for when, shown in seen.shown if when > end_ns)
+    back_ns = seen.back_to_ns(0.8 * case.path.rate_bps, end_ns)
+    refused = sum(seen.counts.get(cause, 0) for cause in ("skeleton malformed", "bulk malformed", "damaged"))
+    return {
+        "packets_damaged": (seen.emulator.there["damaged"] + seen.emulator.back["damaged"], ""),
+        "wrong_skeletons_shown": (sum(when not in sent for when, _ in seen.shown), ""),
+        "wrong_meshes_shown": (sum(size == 0 for _, size in seen.meshes), ""),
+        "refused_by_our_checksums": (refused, ""),
+        "skeleton_lost_share meanwhile": (seen.lost_share(begin_ns, end_ns), ""),
+        "meshes_whole meanwhile": (sum(begin_ns < when < end_ns for when, _ in seen.meshes), ""),
+        "resume_s": ((after[0] - end_ns) / NS if after else float("nan"), "s"),
+        "bulk_back_s": (float("nan") if back_ns is None else (back_ns - end_ns) / NS, "s"),
+    }
+
+
 _DOWN_AND_UP = (Change(6, {"outage": True}), Change(6 + OUTAGE_S, {"outage": False}))
+_DAMAGED = (Change(4, {"damaged": 0.005}), Change(9, {"damaged": 0.0}))
 _CUT_AND_RISE = (Change(6, {"rate_bps": 2e6}), Change(14, {"rate_bps": 10e6}))
 
 
@@ -136,6 +157,10 @@ CASES: dict[str, tuple[NetworkCase, Judge]] = {
         NetworkCase(LinkConditions(10e6, 25), "secure", (Change(6, {"outage": True}, "back"),), seconds=9),
         deaf,
     ),
+    **{
+        f"damaged/10M/{kind}": (NetworkCase(LinkConditions(10e6, 25), kind, _DAMAGED, seconds=18), damage)
+        for kind in ("secure", "tcp")
+    },
     "64k/100ms/tcp": (NetworkCase(LinkConditions(64e3, 50), "tcp", settle_s=10, seconds=40), steady),
     "64k/100ms/secure": (NetworkCase(LinkConditions(64e3, 50), "secure", settle_s=10, seconds=40), steady),
 }
@@ -200,5 +225,7 @@ GOALS: dict[tuple[str, str], float] = {
     ("outage/10M/secure", "resume_s"): 1, ("outage/10M/secure", "oldest_shown_ms"): 300,
     ("outage/10M/secure", "bulk_back_s"): 5,
     ("deaf/10M/secure", "bulk_stops_s"): 0.5,
+    **{(f"damaged/10M/{kind}", f"wrong_{what}_shown"): 0
+       for kind in ("secure", "tcp") for what in ("skeletons", "meshes")},
     ("64k/100ms/tcp", "oldest_shown_ms"): 500, ("64k/100ms/secure", "oldest_shown_ms"): 500,
 }  # fmt: skip

@@ -22,6 +22,7 @@ HELP = """what a path has (the same both ways; there: is from A to B only, back:
   jitter=10ms         each packet's delay differs by up to that; reorder=yes lets packets overtake each other
   loss=1%             of packets, at random
   burst=1%,25%,50%    a path that turns bad with 1 % per packet, good again with 25 %, and loses 50 % while it is bad
+  damaged=0.1%        of packets have a bit flipped that no checksum of IP, UDP and TCP shows
   duplicates=1%       of packets
   outage=yes          nothing arrives; outage=no: again it does
 
@@ -102,6 +103,7 @@ _PARSERS: dict[str, Callable[[str, str], dict[str, Any]]] = {
     "reorder": lambda word, text: {"reorder": _yes(word, text)},
     "loss": lambda word, text: {"loss": _share(word, text), "burst": None},
     "burst": lambda word, text: {"burst": [_share(word, part) for part in text.split(",")]},
+    "damaged": lambda word, text: {"damaged": _share(word, text)},
     "duplicates": lambda word, text: {"duplicates": _share(word, text)},
     "outage": lambda word, text: {"outage": _yes(word, text)},
 }

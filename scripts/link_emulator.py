@@ -28,6 +28,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from scripts.link_model import Link, LinkConditions, conditions_from
+from scripts.packet_damage import flip_a_bit
 
 ADDRESSES = ("198.18.0.1", "198.18.0.2")  # of the range for measurements, RFC 2544; inside our namespaces only
 TUN = Path("/dev/net/tun")
@@ -70,7 +71,10 @@ class Emulator:
     """Carries packets between two TUN devices until its input ends. ``tuns``: file descriptors of A and B."""
 
     def __init__(self, tuns: tuple[int, int], there: LinkConditions, back: LinkConditions) -> None:
-        self.links: dict[str, Link[bytes]] = {"there": Link(there, 1), "back": Link(back, 2)}
+        self.links: dict[str, Link[bytes]] = {
+            "there": Link(there, 1, flip_a_bit),
+            "back": Link(back, 2, flip_a_bit),
+        }
         self.lateness = Lateness()
         a, b = tuns
         self._lanes = ((a, b, self.links["there"]), (b, a, self.links["back"]))

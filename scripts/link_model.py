@@ -1,4 +1,4 @@
-"""A network path in one direction, as arithmetic: rate with a drop-tail queue, delay, jitter, loss, duplicates, outage.
+"""A network path in one direction, as arithmetic: rate and drop-tail queue, delay, jitter, loss, damage, outage.
 
 Time is an argument, so the same model serves simulations in virtual time and the emulator that real packets cross:
 
@@ -10,7 +10,7 @@ from __future__ import annotations
 import heapq
 import random
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass, field, fields, replace
 from typing import Any, Generic, TypeVar
 
@@ -46,7 +46,8 @@ class LinkConditions:
     """What a path does to packets. ``rate_bps`` [bit/s], 0: without limit. ``delay_ms``: one way. ``queue_ms``: depth
     of the queue in front of the limit, in time at ``rate_bps``; ``queue_bytes`` instead fixes it when the rate changes.
     ``jitter_ms``: each packet's delay differs by up to ± this; packets overtake each other only with ``reorder``.
-    ``loss``, ``duplicates``: shares of packets. ``burst``: takes the place of ``loss``. ``outage``: all is lost."""
+    ``loss``, ``damaged``, ``duplicates``: shares of packets. ``burst``: takes the place of ``loss``. ``outage``: all is
+    lost."""
 
     rate_bps: float = 0.0
     delay_ms: float = 0.0
@@ -56,6 +57,7 @@ class LinkConditions:
     reorder: bool = False
     loss: float = 0.0
     burst: BurstLoss | None = None
+    damaged: float = 0.0
     duplicates: float = 0.0
     outage: bool = False
 
@@ -65,7 +67,7 @@ class LinkConditions:
                 raise ValueError(f"{name}: {getattr(self, name)} is negative or not a number")
         if self.queue_bytes is not None and self.queue_bytes < 0:
             raise ValueError(f"queue_bytes: {self.queue_bytes} is negative")
-        for name in ("loss", "duplicates"):
+        for name in ("loss", "damaged", "duplicates"):
             _check_share(name, getattr(self, name))
 
     @property
@@ -103,15 +105,21 @@ class _OnItsWay(Generic[Packet]):
 
 
 class Link(Generic[Packet]):
-    """One direction. ``put`` packets in, ``take`` them out when they are due.
+    """One direction. ``put`` packets in, ``take`` them out when they are due. ``damage``: what happens to damaged ones.
 
     ``counts``: packets and bytes put in, delivered, and lost by cause. Deterministic for one ``seed``.
     """
 
-    def __init__(self, conditions: LinkConditions, seed: int = 1) -> None:
+    def __init__(
+        self,
+        conditions: LinkConditions,
+        seed: int = 1,
+        damage: Callable[[Packet, random.Random], Packet] = lambda packet, _: packet,
+    ) -> None:
         self.counts: Counter[str] = Counter()
         self.conditions = conditions
         self._chance = random.Random(seed)
+        self._damage = damage
         self._bad = False  # Gilbert–Elliott's state
         self._free_ns = 0  # when the serialiser is done with all that waits
         self._last_due_ns = 0
@@ -160,6 +168,9 @@ class Link(Generic[Packet]):
         if lost is not None:
             self.counts[lost] += 1
             return
+        if now.damaged and self._chance.random() < now.damaged:
+            self.counts["damaged"] += 1
+            packet = self._damage(packet, self._chance)
         self._free_ns = max(self._free_ns, now_ns)
         if now.rate_bps:
             self._free_ns += int(size * 8 / now.rate_bps * S)

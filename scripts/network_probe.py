@@ -36,6 +36,7 @@ from sender.receiver_links import ReceiverLinks
 SITE, FRAME_S = "studio", 1 / 30
 REPORT_S = 0.05  # as the receiver daemon does
 MESH_BYTES = 100_000
+MESH = random.Random(1).randbytes(MESH_BYTES)
 CLOCK = MonotonicClock()
 
 
@@ -64,13 +65,12 @@ class EndlessMeshes(MeshScheduler):
         super().__init__()
         self.on = False
         self._number = 0
-        self._mesh = random.Random(1).randbytes(MESH_BYTES)
 
     def next_for(self, receiver_id: str, budget_bytes: int, now_ns: int) -> tuple[int, bytes] | None:
         if not self.on:
             return None
         self._number += 1
-        return self._number, self._mesh
+        return self._number, MESH
 
     def sent(self, receiver_id: str, pose_id: int, now_ns: int) -> SendRecord | None:
         return SendRecord(receiver_id, pose_id, Reason.FIRST, 0.0, 0.0, 0.0, MESH_BYTES, 0, now_ns, now_ns)
@@ -138,7 +138,7 @@ async def receive(settings: ProbeSettings) -> dict[str, Any]:
     shown: list[tuple[int, int, int]] = []  # sequence number, when sent, when it arrived [ns]
     bulk: list[tuple[int, int]] = []  # when, bytes so far
     taken = [(0, 1)]  # from when, 1 in how many skeletons
-    meshes: list[tuple[int, int]] = []  # when, bytes
+    meshes: list[tuple[int, int]] = []  # when, bytes; 0: not the one that was sent
     name = receiver_name("lobby", settings.name) if settings.certificates else settings.name
     allowed = for_receiver(SITE, name) if settings.certificates else ()
     async with open_session(settings.link(), allowed) as session:
@@ -161,6 +161,8 @@ async def receive(settings: ProbeSettings) -> dict[str, Any]:
         channels.close()
         counts = channels.stream.skeletons.counts | channels.stream.assembler.counts
         counts["not fresh"] = channels.freshness.stale
+        for name, subscriber in channels.subscribers.items():
+            counts |= {f"{name} {cause}": count for cause, count in subscriber.counts.items()}
         return {"shown": shown, "bulk": bulk, "meshes": meshes, "taken": taken, "counts": counts}
 
 
@@ -175,7 +177,7 @@ def _receiving(
     channels.open(
         Handlers(
             skeleton=on_skeleton,
-            pose=lambda message: meshes.append((CLOCK.now_ns(), len(message))),
+            pose=lambda message: meshes.append((CLOCK.now_ns(), len(message) if message == MESH else 0)),
             body=lambda message: None,
             epoch=lambda: None,
             presence=lambda there: None,

@@ -98,6 +98,18 @@ def test_skeletons_wait_little_beside_endless_meshes(tmp_path: Path) -> None:
 @pytest.mark.network_long
 @pytest.mark.usefixtures("asked_for_long")
 @pytest.mark.parametrize("kind", ["secure", "tcp"])
+def test_of_damaged_packets_nothing_is_shown_and_the_links_recover(kind: str, tmp_path: Path) -> None:
+    case, judge = CASES[f"damaged/10M/{kind}"]
+    figures = judge(case, not_void(run_case(case, tmp_path)))
+    assert figures["packets_damaged"][0] > 5
+    assert figures["wrong_skeletons_shown"][0] == figures["wrong_meshes_shown"][0] == 0
+    assert figures["resume_s"][0] <= 5
+    assert figures["bulk_back_s"][0] <= 8
+
+
+@pytest.mark.network_long
+@pytest.mark.usefixtures("asked_for_long")
+@pytest.mark.parametrize("kind", ["secure", "tcp"])
 def test_after_an_outage_skeletons_are_fresh_at_once_and_bulk_comes_back(kind: str, tmp_path: Path) -> None:
     case, _ = CASES[f"outage/10M/{kind}"]
     seen = not_void(run_case(case, tmp_path))
