@@ -28,6 +28,7 @@ GIVEN_WAY_BPS = 1.5 * FLOOR_BPS  # bulk that takes less has no more to give way 
 BAD_NS = 1_000_000_000  # so long it must be bad
 SILENCE_NS = 1_500_000_000  # without any skeleton
 SETTLE_NS = 2_000_000_000  # so long a change takes to show, once what waits in the queue has passed
+TRIAL_NS = 5_000_000_000  # so long a path that carries nearly enough takes to show it
 PATIENCE_NS, PATIENCE_MAX_NS = 4_000_000_000, 160_000_000_000  # so long all must be well before more are tried
 
 
@@ -150,5 +151,5 @@ class LayerSubscription:
     def _change(self, layers: int, now_ns: int) -> None:
         self._joined = self._on_trial = layers > self.layers
         self.layers = layers
-        self._settled_ns = now_ns + SETTLE_NS + int(self._heard[-1].queueing_s / NS)
+        self._settled_ns = now_ns + (TRIAL_NS if self._on_trial else SETTLE_NS) + int(self._heard[-1].queueing_s / NS)
         self._forget()

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from common.transport.temporal_layers import LAYERS, between, divisor_of, layer_of
-from receiver.layer_subscription import BAD_NS, PATIENCE_NS, SETTLE_NS, LayerSubscription
+from receiver.layer_subscription import BAD_NS, PATIENCE_NS, SETTLE_NS, TRIAL_NS, LayerSubscription
 from scripts.bulk_simulation import MS, BulkSimulation, Competitor, S
 from scripts.link_model import LinkConditions
 
@@ -138,7 +138,7 @@ def test_a_layer_on_trial_goes_at_once_when_a_queue_begins_and_bulk_waits_for_th
     receiver.live(PATIENCE_NS / S + 1)
     assert [layers for _, layers in receiver.changes] == [4]
     assert (receiver.layers.divisor, receiver.layers.carried_divisor) == (1, 2)
-    receiver.live(3)
+    receiver.live(TRIAL_NS / S)
     assert receiver.layers.carried_divisor == 1
     short = Thin(3, queue_ms=100, loses=False)  # too short to count but on trial
     short.layers.layers = 3
