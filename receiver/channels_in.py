@@ -78,6 +78,7 @@ class ReceiverChannels:
         self._layers = LayerSubscription()
         self.freshness = Freshness()
         self.first_skeleton_ns: int | None = None  # when the very first one arrived
+        self.offered_poses = 0  # how many the sender held when it was last asked
         self._report = ChannelPublisher(session, channels.REPORT, self._key(channels.REPORT, name))
         self._handlers: Handlers | None = None
 
@@ -153,6 +154,7 @@ class ReceiverChannels:
                 self.counts["repository list malformed"] += 1
                 continue
             if (theirs.sender_epoch, theirs.receiver_epoch) == (newest.epoch, self._epoch):
+                self.offered_poses = len(theirs.poses)
                 return dict(theirs.poses)
         return None
 

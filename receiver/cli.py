@@ -61,6 +61,9 @@ def parse_arguments(arguments: list[str] | None = None) -> argparse.Namespace:
         "--points", dest="view.mode", action="store_const", const="points", help="show points; P on the page switches"
     )
     view.add_argument(
+        "--live", dest="view.mode", action="store_const", const="live", help="meshes follow residual maps; L switches"
+    )
+    view.add_argument(
         "--log-shown", dest="shown_log", type=Path, metavar="FILE", help="keep what was shown, for measuring"
     )
     view.add_argument(
@@ -112,6 +115,9 @@ def parse_decode_arguments(arguments: list[str]) -> argparse.Namespace:
     )
     parser.add_argument(
         "--points", dest="view.mode", action="store_const", const="points", help="residual maps' points, not meshes"
+    )
+    parser.add_argument(
+        "--live", dest="view.mode", action="store_const", const="live", help="meshes that follow residual maps"
     )
     parser.add_argument("--page", action="store_true", help="play it in the browser page instead")
     parser.add_argument("--once", action="store_true", help="with --page: end when it has been played")

@@ -51,13 +51,13 @@ class ViewSettings:
     """``headless``: render offscreen instead of serving a page. ``display_hz``: rate of display ticks.
     ``smoothness``: 0 shows the newest skeleton at once, 1 plays them at an even pace, later; between, with less delay,
     more of the motion is extrapolated.
-    ``mode``: the person as the best candidate pose's "mesh", or as the "points" of the newest residual maps; a page can
-    switch.
+    ``mode``: the person as the best candidate pose's "mesh"; "live", as that mesh following the newest residual maps;
+    or as their "points". A page can switch.
     ``window``: the page in a desktop window too, whose closing ends the receiver (needs the ``open3d`` extra).
     ``skinning``: how a mesh bends at its joints. ``allowed_hosts``: names besides loopback ones for the page."""
 
     headless: bool = False
-    mode: Literal["mesh", "points"] = "mesh"
+    mode: Literal["mesh", "live", "points"] = "mesh"
     window: bool = False
     display_hz: float = 30.0
     smoothness: float = 0.0

@@ -1,7 +1,7 @@
 """The receiver daemon: skeletons and candidate poses in, a moving person out.
 
-The newest skeleton goes to the animation thread (newest wins), whose result the loop shows. Candidate poses are meshed
-one after the other on a thread of their own, so that a mesh never holds up a skeleton.
+The newest skeleton goes to the animation thread (newest wins), whose result the loop shows. What takes longer,
+candidate poses and residual maps, is made ready beside it (``PoseMaker``, ``MapMaker``).
 """
 
 from __future__ import annotations
@@ -9,9 +9,8 @@ from __future__ import annotations
 import asyncio
 import logging
 import secrets
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Coroutine
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -19,27 +18,25 @@ from typing import Any
 from common.body.skeleton import Skeleton
 from common.runtime.clock import MonotonicClock
 from common.runtime.compute_worker import ComputeWorker
-from common.runtime.config_file import dump_settings
 from common.runtime.daemon import Daemon, DaemonError
 from common.runtime.http_access import read_token, tls_context
-from common.runtime.metrics import Health, Metrics, daemon_app, serve_app
+from common.runtime.metrics import Health, daemon_app, serve_app
 from common.runtime.run_statistics import RunStatistics, write_statistics
 from common.runtime.session_recording import RecordingError
 from common.runtime.stage_timer import StageTimer
 from common.runtime.steady_ticks import steadily
-from common.runtime.threads import into_background
 from common.transport.access_rules import for_receiver, receiver_name
 from common.transport.link_settings import with_endpoints
 from common.transport.zenoh_session import ZenohSession, open_session, own_certificate
-from common.wire.header import WireError
 from common.wire.receiver_report import WANTS_RESIDUALS
-from common.wire.repository_list import REPOSITORY_LIST_MAX_POSES
 from common.wire.skeleton_packet import SkeletonPacket
 from receiver.channels_in import Handlers, ReceiverChannels
 from receiver.config import ReceiverSettings
 from receiver.jitter_buffer import JitterBuffer
-from receiver.pipeline import AnimationPath, PointPath, ReceivedPose, Shown, SkeletonToShow, mesh_of
-from receiver.point_maker import PointMaker
+from receiver.map_maker import MapMaker
+from receiver.pipeline import AnimationPath, MapPath, NewMaps, Shown, SkeletonToShow
+from receiver.pose_maker import PoseMaker
+from receiver.receiver_figures import ReceiverFigures
 from receiver.rehearsal import rehearse
 from receiver.session_log import SessionLog
 from receiver.show_log import ShowLog
@@ -55,7 +52,6 @@ STATUS_PERIOD_S = 0.25
 CLOCK_PERIOD_S = 1.0
 CLOCK_QUICK_PERIOD_S = 0.1  # until the offset is known
 BODY_PERIOD_S = 0.1
-MESHES_WAITING = 8
 
 
 class ReceiverDaemon:
@@ -108,7 +104,6 @@ class _Show:
         self._clock = clock
         self._health = health
         self._timer = StageTimer(clock)
-        self._statistics = RunStatistics(self._timer)
         self._counts: Counter[str] = Counter()
         self._session_log = _open_session_log(settings)
         self._channels = ReceiverChannels(
@@ -124,12 +119,8 @@ class _Show:
         self._state = StreamState(clock)
         self._animation_path = AnimationPath(settings.repository, self._timer, clock)
         self._animation = ComputeWorker("animation", self._animation_path.show, self._on_shown, rehearse)
-        self._mesher = ThreadPoolExecutor(1, "mesher", into_background)
-        self._messages: asyncio.Queue[bytes] = asyncio.Queue(MESHES_WAITING)
-        self._held: tuple[int, dict[int, int]] = (-1, {})  # sender's run; bytes of the poses taken in, by id
-        self._offered_poses = self._poses_received = self._poses_meshed = 0
+        self._poses = PoseMaker(settings.person, settings.repository.score_form, self._timer, self._on_mesh)
         self._appeared = asyncio.Event()
-        self._meshes: deque[ReceivedPose] = deque()  # meshed, waiting for the next skeleton; bounded in _mesh_poses
         self._newest: SkeletonToShow | None = None
         smoothness = settings.view.smoothness
         self._jitter = JitterBuffer(smoothness) if smoothness > 0 else None  # without it the newest wins
@@ -140,22 +131,34 @@ class _Show:
             if view.headless
             else WebViewer(allowed_hosts=view.allowed_hosts, skinning=view.skinning, mode=view.mode)
         )
-        points = PointPath(settings.person, self._timer)
-        self._points = PointMaker(points, self._channels.stream.bodies, self.viewer.show_points)
-        self.metrics = self._make_metrics()
+        maps = MapPath(settings.person, self._timer)
+        self._maps = MapMaker(maps, self._channels.stream.bodies, lambda: self.viewer.wants_points, self._on_maps)
+        self._figures = ReceiverFigures(
+            settings,
+            self._timer,
+            RunStatistics(self._timer),
+            self._channels,
+            self._state,
+            self._animation,
+            self._poses,
+            self._maps,
+            self._jitter,
+            self._counts,
+        )
+        self.metrics = self._figures.metrics()
         session.add_metrics(self.metrics)
 
     async def run(self, daemon: Daemon, page: str) -> None:
         """Receive and show until cancelled, or until the window on ``page`` is closed where there is one."""
         self._channels.open(
             Handlers(
-                self._on_skeleton, self._on_pose, self._on_body, self._on_epoch, self._on_presence, self._points.submit
+                self._on_skeleton, self._on_pose, self._on_body, self._on_epoch, self._on_presence, self._maps.submit
             )
         )
         lasting: list[Coroutine[Any, Any, None]] = [
             self._animation.run(),
-            self._mesh_poses(),
-            self._points.run(),
+            self._poses.run(),
+            self._maps.run(),
             steadily(REPORT_PERIOD_S, self._report),
             steadily(STATUS_PERIOD_S, self._tell_status),
             steadily(1 / self._settings.view.display_hz, self._tick, self._on_missed_ticks),
@@ -177,8 +180,8 @@ class _Show:
     def close(self) -> None:
         """Hear nothing more, and write out what is buffered."""
         self._channels.close()
-        self._mesher.shutdown(wait=False, cancel_futures=True)
-        self._points.close()
+        self._poses.close()
+        self._maps.close()
         for kept in (self._log, self._session_log):
             if kept is not None:
                 kept.close()
@@ -192,7 +195,7 @@ class _Show:
             self._jitter.push(packet, body, self._clock.now_ns())
 
     def _animate(self, packet: SkeletonPacket, body: Skeleton) -> None:
-        self._newest = SkeletonToShow(packet, body, self._meshes)
+        self._newest = SkeletonToShow(packet, body, self._poses.meshes)
         self._animation.submit(self._newest)
 
     def _on_body(self, message: bytes) -> None:
@@ -209,45 +212,17 @@ class _Show:
             self._appeared.set()
 
     def _on_pose(self, message: bytes) -> None:
-        """A candidate pose is complete; when too many wait for meshing the oldest goes."""
         self._record("pose", message)
-        self._poses_received += 1
-        if self._messages.full():
-            self._messages.get_nowait()
-            self._counts["pose waiting too long"] += 1
-        self._messages.put_nowait(message)
+        self._poses.submit(message)
 
-    async def _mesh_poses(self) -> None:
-        """Mesh candidate poses, one after the other."""
-        loop = asyncio.get_running_loop()
-        while True:
-            message = await self._messages.get()
-            try:
-                with self._timer.stage("mesh"):
-                    settings = self._settings
-                    mesh = await loop.run_in_executor(
-                        self._mesher, mesh_of, message, settings.person, settings.repository.score_form
-                    )
-            except WireError as error:
-                self._counts["pose refused"] += 1
-                log.warning("a candidate pose is refused: %s", error)
-                continue
-            self._poses_meshed += 1
-            while len(self._meshes) >= MESHES_WAITING:  # no skeletons come: nobody takes them
-                self._meshes.popleft()
-                self._counts["mesh waiting too long"] += 1
-            self._meshes.append(mesh)
-            self._note_held(mesh.epoch, mesh.mesh.pose_id, len(message))
-            if self._state.first_body_ns is None and self._newest is not None:
-                self._animation.submit(self._newest)  # the first sight waits for no other skeleton
+    def _on_mesh(self) -> None:
+        if self._state.first_body_ns is None and self._newest is not None:
+            self._animation.submit(self._newest)  # the first sight waits for no other skeleton
 
-    def _note_held(self, epoch: int, pose_id: int, size: int) -> None:
-        if epoch != self._held[0]:
-            self._held = epoch, {}
-        held = self._held[1]
-        held[pose_id] = size
-        if len(held) > REPOSITORY_LIST_MAX_POSES:
-            del held[next(iter(held))]
+    def _on_maps(self, new: NewMaps) -> None:
+        self._animation_path.live.note_maps(new.maps if self.viewer.wants_live else None)
+        if new.points is not None:
+            self.viewer.show_points(new.points)
 
     async def _tell_what_is_here(self) -> None:
         """Whenever a sender appears: a pose that is here need not be sent (again)."""
@@ -255,10 +230,9 @@ class _Show:
             await self._appeared.wait()
             self._appeared.clear()
             while not self._appeared.is_set():
-                offered = await self._channels.ask_repository(*self._held)
+                offered = await self._channels.ask_repository(*self._poses.held)
                 if offered is not None:
-                    self._offered_poses = len(offered)
-                    log.info("of the sender's %d poses %d are here", len(offered), len(self._held[1]))
+                    log.info("of the sender's %d poses %d are here", len(offered), len(self._poses.held[1]))
                     break
                 await asyncio.sleep(BODY_PERIOD_S)
 
@@ -298,7 +272,7 @@ class _Show:
         self._counts["tick missed"] += count
 
     def _report(self) -> None:
-        wants = WANTS_RESIDUALS if self.viewer.wants_points else 0
+        wants = WANTS_RESIDUALS if self.viewer.wants_points or self.viewer.wants_live else 0
         self._channels.send_report(self._state.repository_poses, wants)
 
     def _tell_status(self) -> None:
@@ -331,78 +305,11 @@ class _Show:
         if self._log is not None:
             self._log.add(kind, self._clock.now_ns(), payload)
 
-    def _make_metrics(self) -> Metrics:
-        metrics = Metrics()
-        metrics.stages(self._timer)
-        skeletons = self._channels.stream.skeletons.counts
-        metrics.counter("skeletons_received_total", "Skeletons that were the newest", lambda: skeletons["accepted"])
-        metrics.counter("skeletons_lost_total", "Gaps in the sequence", lambda: skeletons["lost"])
-        about = "1 in so many skeletons is taken, since the path carries no more"
-        metrics.gauge("skeleton_divisor", about, lambda: self._channels.skeleton_divisor)
-        arrivals = self._channels.subscribers
-        metrics.counter(
-            "arrived_total",
-            "Messages, by channel",
-            lambda: {name: subscriber.arrivals for name, subscriber in arrivals.items()},
-            "channel",
-        )
-        metrics.counter("candidate_poses_received_total", "Arrived whole", lambda: self._poses_received)
-        metrics.counter("candidate_poses_meshed_total", "Ready to be shown", lambda: self._poses_meshed)
-        metrics.counter("frames_shown_total", "Frames given to the viewer", lambda: self._state.frames_shown)
-        metrics.counter("points_shown_total", "Residual packets given to the viewer", lambda: self._points.made)
-        metrics.counter("dropped_total", "What was dropped, by cause", self._dropped)
-        metrics.gauge("repository_poses", "Candidate poses held", lambda: self._state.repository_poses)
-        metrics.gauge("offered_poses", "Poses the sender held when it was last asked", lambda: self._offered_poses)
-        jitter = self._jitter
-        if jitter is not None:
-            about = "How much later than at the soonest skeletons are shown"
-            metrics.gauge("jitter_delay_ms", about, lambda: jitter.delay_ns / 1e6)
-            metrics.counter("played_total", "Display ticks by where their pose came from", lambda: jitter.counts)
-        about = "Distortion of each region of the mesh on screen (DISPOSE Eq. 1)"
-        metrics.gauge("region_sigma", about, lambda: self._state.region_sigma, "region")
-        return metrics
-
-    def _dropped(self) -> dict[str, float]:
-        channels = self._channels
-        judged = {f"skeleton {cause}": channels.stream.skeletons.counts[cause] for cause in
-                  ("stale", "duplicate", "old_epoch", "far_future", "lost", "not taken")}  # fmt: skip
-        refused = {
-            f"{name} {cause}": count
-            for name, subscriber in channels.subscribers.items()
-            for cause, count in subscriber.counts.items()
-        }
-        chunks = {f"chunk {cause}": count for cause, count in channels.stream.assembler.counts.items()}
-        return {
-            "animation busy": self._animation.dropped,
-            "skeleton not fresh": channels.freshness.stale,
-            **judged,
-            **refused,
-            **chunks,
-            **{f"residual {cause}": count for cause, count in self._points.counts.items()},
-            **channels.counts,
-            **channels.stream.counts,
-            **self._counts,
-        }
-
-    def _time_to_first_body_s(self) -> float | None:
-        """From the very first skeleton's arrival to the first mesh shown."""
-        begin_ns, end_ns = self._channels.first_skeleton_ns, self._state.first_body_ns
-        return None if begin_ns is None or end_ns is None else (end_ns - begin_ns) / 1e9
-
     def figures(self) -> dict[str, Any]:
         """Everything worth keeping of the run."""
-        rendered = self.viewer.frames_rendered if isinstance(self.viewer, HeadlessScreen) else None
-        return self._statistics.figures() | {
-            "settings": dump_settings(self._settings),
-            "skeletons_received": self._channels.stream.skeletons.counts["accepted"],
-            "frames_shown": self._state.frames_shown,
-            "frames_rendered": self._state.frames_shown if rendered is None else rendered,
-            "time_to_first_body_s": self._time_to_first_body_s(),
-            "repository_poses": self._state.repository_poses,
-            "skeleton_bytes": self._channels.subscribers["skeleton"].arrived_bytes if self._channels.subscribers else 0,
-            "bulk_bytes": self._channels.subscribers["bulk"].arrived_bytes if self._channels.subscribers else 0,
-            "dropped": self._dropped(),
-        }
+        return self._figures.of_the_run(
+            self.viewer.frames_rendered if isinstance(self.viewer, HeadlessScreen) else None
+        )
 
 
 def _open_show_log(file: Path | None) -> ShowLog | None:

@@ -49,7 +49,7 @@ def decode(settings: ReceiverSettings, options: DecodeOptions, say: Callable[[st
     try:
         reader = SessionReader(options.session, SCHEMA)
         rate_hz = options.rate_hz or frame_rate_hz(reader)
-        player = SessionPlayer(settings.repository, person_of(reader), points=settings.view.mode == "points")
+        player = SessionPlayer(settings.repository, person_of(reader), (settings.view.mode,))
         output = _output(settings, options, rate_hz)
         try:
             interrupted = not _play(reader, player, output, rate_hz)
@@ -88,7 +88,7 @@ def _output(settings: ReceiverSettings, options: DecodeOptions, rate_hz: float) 
         return VideoFile(options.out, rate_hz, *seen)
     if options.kind == "png":
         return PictureFolder(options.out, *seen)
-    if settings.view.mode == "mesh":
+    if settings.view.mode != "points":
         return PersonFolder(options.out, f".{options.kind}", skinning)
     if options.kind != "ply":
         raise ExportError(f"points are written as ply, not as {options.kind}")

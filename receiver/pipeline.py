@@ -1,7 +1,8 @@
 """The receiver on one page: from a skeleton packet to what the viewer shows, and from a candidate pose to its mesh.
 
-DISPOSE Fig. 1, right half: the skeleton never waits for a mesh; it moves the best of those already here. In point mode
-(Lien §5) it moves the points of the newest residual packet, which ``PointPath`` makes.
+DISPOSE Fig. 1, right half: the skeleton never waits for a mesh; it moves the best of those already here. ``MapPath``
+decodes residual packets (Lien §5): of the newest one, either the mesh moved takes colour and shape (``LivePath``), or,
+in point mode, its points are moved.
 """
 
 from __future__ import annotations
@@ -29,9 +30,10 @@ from common.wire.header import WireError
 from common.wire.residual_packet import decode_residual_header
 from common.wire.skeleton_packet import SkeletonPacket
 from receiver.config import RepositorySettings as Settings
+from receiver.live_path import LivePath
 from receiver.repository.pose_repository import PoseRepository, RepositorySettings
 from receiver.repository.pose_selection import PoseSelector, Selection, SelectionSettings
-from receiver.residual_decoder import ResidualDecoder, link_points
+from receiver.residual_decoder import ResidualDecoder, ResidualMaps, link_points
 from receiver.viewer.viewer import ShownFrame
 
 RESIDUAL_POINTS_MAX = 200_000  # bounds what a packet can make us allocate
@@ -95,8 +97,16 @@ def mesh_of(message: bytes, person: int, score_form: ScoreForm = "joining-edges"
     return ReceivedPose(candidate.epoch, mesh)
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class NewMaps:
+    """A residual packet's maps, and their points where these are wanted."""
+
+    maps: ResidualMaps
+    points: LinkPoints | None
+
+
 class AnimationPath:
-    """Every skeleton: repository → pose selection by σ → animation. One thread's own."""
+    """Every skeleton: repository → pose selection by σ → animation. One thread's own, but for ``live.note_maps``."""
 
     def __init__(self, settings: Settings, timer: StageTimer, clock: Clock) -> None:
         bounds = RepositorySettings(
@@ -114,6 +124,7 @@ class AnimationPath:
                 withhold_factor=settings.withhold_factor,
             )
         )
+        self.live = LivePath(timer)
         self._timer = timer
         self._clock = clock
         self._shown: ShownFrame | None = None  # the last one that was not withheld
@@ -150,7 +161,11 @@ class AnimationPath:
             return replace(self._shown, withheld=True, links=T_world_link[:, :3])  # points are never withheld
         self._repository.count_use(selection.pose_id)
         mesh = self._repository.get(selection.pose_id)
-        self._shown = _shown_frame(packet, mesh, T_world_link, selection.sigma)
+        frame = _shown_frame(packet, mesh, T_world_link, selection.sigma)
+        assert mesh is not None
+        assert frame.motion is not None
+        surface, live = self.live.surface(mesh, frame.motion, T_world_link, packet.epoch, packet.capture_ns)
+        self._shown = replace(frame, surface=surface, live=live)
         return self._shown
 
     def _select(self, T_world_link: NDArray[np.float32]) -> Selection | None:
@@ -179,11 +194,12 @@ class AnimationPath:
         if epoch != self._repository.epoch:
             self._shown = None
             self._repository.reset(epoch)
+            self.live.forget()
 
 
-class PointPath:
-    """Every residual packet → maps → the person's points on their links. One thread's own. ``counts``: packets of no
-    use, by cause."""
+class MapPath:
+    """Every residual packet → maps → where they are wanted, the person's points on their links. One thread's own.
+    ``counts``: packets of no use, by cause."""
 
     def __init__(self, person: int, timer: StageTimer) -> None:
         self._person = person
@@ -194,8 +210,8 @@ class PointPath:
     def counts(self) -> Counter[str]:
         return Counter({"late": self._decoder.late, "without reference": self._decoder.without_reference})
 
-    def take(self, message: bytes, bodies: Callable[[int], Mapping[int, Skeleton]]) -> LinkPoints | None:
-        """The points now, None where the packet shows nothing newer; ``bodies(epoch)``: sizes by revision.
+    def take(self, message: bytes, bodies: Callable[[int], Mapping[int, Skeleton]], as_points: bool) -> NewMaps | None:
+        """The maps now, None where the packet shows nothing newer; ``bodies(epoch)``: sizes by revision.
 
         Raises:
             WireError: it cannot be decoded, or is another person's.
@@ -205,7 +221,7 @@ class PointPath:
             raise WireError(f"residual packet of person {header.person}, expected {self._person}")
         with self._timer.stage("residual maps"):
             maps = self._decoder.decode(message, bodies(header.epoch))
-            return None if maps is None else link_points(maps)
+            return None if maps is None else NewMaps(maps, link_points(maps) if as_points else None)
 
 
 def _shown_frame(

@@ -3,24 +3,32 @@
 from __future__ import annotations
 
 from collections import deque
+from dataclasses import replace
 
 import numpy as np
 
+from common.body.cylindrical_map import LinkMaps
 from common.body.mannequin import mannequin, mannequin_camera, mannequin_depth
 from common.body.rigging import Rigging
+from common.body.skeleton import Skeleton
+from common.body.skeleton_pose import SkeletonPose
 from common.body.view import View
 from common.runtime.clock import MonotonicClock
 from common.runtime.stage_timer import StageTimer
 from common.wire.candidate_pose import CandidatePose, encode_candidate_pose
+from common.wire.map_codec import MapQuality
+from common.wire.residual_packet import ResidualHeader
 from common.wire.skeleton_packet import SkeletonPacket, decode_skeleton, encode_skeleton
 from receiver.config import RepositorySettings
+from receiver.live_path import FADE_NS
 from receiver.pipeline import AnimationPath, SkeletonToShow, mesh_of
+from receiver.residual_decoder import ResidualMaps
 from receiver.viewer.offscreen_viewer import OffscreenViewer
 from receiver.viewer.page_messages import encode_frame, encode_pose
 
 
 def rehearse() -> None:
-    """Mesh a candidate pose, select and animate it, and show it both ways."""
+    """Mesh a candidate pose, select and animate it, let it follow residual maps, and show it both ways."""
     skeleton, pose = mannequin()
     camera = mannequin_camera()
     depth = mannequin_depth(camera)
@@ -30,8 +38,10 @@ def rehearse() -> None:
     packet = decode_skeleton(encode_skeleton(SkeletonPacket(0, 0, 0, 0, 0, 1.0, pose)))
     clock = MonotonicClock()
     path = AnimationPath(RepositorySettings(), StageTimer(clock), clock)
-    viewer = OffscreenViewer()
+    viewer = OffscreenViewer(mode="live")
+    path.live.note_maps(_maps(skeleton, pose))
     for _ in range(2):  # the second pose meets the first in the repository
+        packet = replace(packet, sequence=packet.sequence + 1, capture_ns=packet.capture_ns + FADE_NS)
         shown = path.show(SkeletonToShow(packet, skeleton, deque([mesh_of(message, 0, "all-edges")])))
         for mesh in shown.added:
             viewer.add_pose(mesh)
@@ -40,3 +50,13 @@ def rehearse() -> None:
             viewer.show(shown.frame)
             encode_frame(shown.frame)
     viewer.render([camera])
+
+
+def _maps(skeleton: Skeleton, pose: SkeletonPose) -> ResidualMaps:
+    """A band around the middle of each link."""
+    quality = MapQuality(50, 1)
+    header = ResidualHeader(0, 0, 0, "key", 0, 0, 0, 0, 1000, 50.0, quality)
+    layout = header.layout(skeleton)
+    shape = layout.height, layout.width
+    maps = LinkMaps(np.ones(shape, np.bool_), np.full((*shape, 3), 128, np.uint8), np.full(shape, 30, np.uint8))
+    return ResidualMaps(header, skeleton, layout, maps)

@@ -84,14 +84,15 @@ class ResidualDecoder:
 def cloud(shown: ResidualMaps, T_world_link: NDArray[np.float32]) -> PointCloud:
     """The person's points, as dense at every level, moved to the links ``T_world_link`` (L, 4, 4) of any pose of the
     same body. Normals are the directions away from the bones."""
-    return PointCloud(*unproject(*_at_full_level(shown), T_world_link))
+    return PointCloud(*unproject(*at_level(shown, LEVEL_MAX), T_world_link))
 
 
 def link_points(shown: ResidualMaps) -> LinkPoints:
     """The same points on their links: worked out once, moved by every skeleton."""
-    return unproject_to_links(*_at_full_level(shown))
+    return unproject_to_links(*at_level(shown, LEVEL_MAX))
 
 
-def _at_full_level(shown: ResidualMaps) -> tuple[MapLayout, LinkMaps]:
-    full = map_layout(shown.skeleton, shown.header.points, LEVEL_MAX)
-    return full, shown.maps if shown.layout is full else resampled(shown.layout, shown.maps, full)
+def at_level(shown: ResidualMaps, level: float) -> tuple[MapLayout, LinkMaps]:
+    """The same surface on the grids of another ``level``."""
+    other = map_layout(shown.skeleton, shown.header.points, level)
+    return other, shown.maps if shown.layout is other else resampled(shown.layout, shown.maps, other)

@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import get_args
 
 from common.body.link_points import LinkPoints
 from common.runtime.clock import MonotonicClock
@@ -24,6 +25,7 @@ from receiver.decode import DecodeError, check_played, faults, person_of
 from receiver.pipeline import Shown
 from receiver.session_player import SILENCE_NS, SessionPlayer, put_on
 from receiver.stream_state import StreamState
+from receiver.viewer.viewer import ViewMode
 from receiver.viewer.web_viewer import WebViewer
 
 log = logging.getLogger(__name__)
@@ -88,7 +90,7 @@ class SessionPage:
         self._poses.clear()
         self._viewer.show_points(None)
         reader = SessionReader(self._session, SCHEMA)
-        player = SessionPlayer(self._settings.repository, person_of(reader), points=True)
+        player = SessionPlayer(self._settings.repository, person_of(reader), get_args(ViewMode))
         ahead: asyncio.Queue[_Due | None] = asyncio.Queue(AHEAD)
         async with asyncio.TaskGroup() as group:
             group.create_task(self._play_ahead(_due(reader, player), ahead))

@@ -6,7 +6,7 @@ The same stream, meshes, choice and animation as the daemon's; the same file giv
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Container, Iterable, Iterator
 
 from common.body.link_points import LinkPoints
 from common.runtime.clock import ManualClock
@@ -18,18 +18,18 @@ from common.wire.header import WireError
 from common.wire.residual_packet import is_residual
 from receiver.config import RepositorySettings
 from receiver.incoming_stream import IncomingStream
-from receiver.pipeline import AnimationPath, PointPath, ReceivedPose, Shown, SkeletonToShow, mesh_of
-from receiver.viewer.viewer import Viewer
+from receiver.pipeline import AnimationPath, MapPath, ReceivedPose, Shown, SkeletonToShow, mesh_of
+from receiver.viewer.viewer import Viewer, ViewMode
 
 MESHES_WAITING = 8  # for the next skeleton, as in the daemon
 SILENCE_NS = 10_000_000_000  # a gap between two messages that is longer is not played
 
 
 class SessionPlayer:
-    """Plays the stream of ``person``, residual maps too if ``points`` are wanted. ``counts``: messages by what became
-    of them; ``last_error``: of a refused one; ``payload_bytes``: by channel."""
+    """Plays the stream of ``person`` as whoever shows these ``modes`` needs it. ``counts``: messages by what became of
+    them; ``last_error``: of a refused one; ``payload_bytes``: by channel."""
 
-    def __init__(self, settings: RepositorySettings, person: int, points: bool = False) -> None:
+    def __init__(self, settings: RepositorySettings, person: int, modes: Container[ViewMode] = ("mesh",)) -> None:
         self.counts: Counter[str] = Counter()
         self.payload_bytes: Counter[str] = Counter()
         self.last_error = ""
@@ -39,8 +39,8 @@ class SessionPlayer:
         clock = ManualClock()
         timer = StageTimer(clock)
         self._animation = AnimationPath(settings, timer, clock)
-        self._points = PointPath(person, timer)
-        self._wants_points = points
+        self._maps = MapPath(person, timer)
+        self._modes = modes
         self._arrived: deque[ReceivedPose] = deque(maxlen=MESHES_WAITING)
 
     def take(self, message: StoredMessage) -> Shown | LinkPoints | None:
@@ -74,12 +74,19 @@ class SessionPlayer:
         whole = self._stream.chunk(decode_chunk(payload))
         if whole is not None and is_residual(whole):
             self.counts["residuals"] += 1
-            return self._points.take(whole, self._stream.bodies) if self._wants_points else None
+            return self._take_residual(whole)
         if whole is not None:
             self.counts["pose waiting too long"] += len(self._arrived) == MESHES_WAITING
             self._arrived.append(mesh_of(whole, self._person, self._settings.score_form))
             self.counts["poses"] += 1
         return None
+
+    def _take_residual(self, packet: bytes) -> LinkPoints | None:
+        live, points = "live" in self._modes, "points" in self._modes
+        new = self._maps.take(packet, self._stream.bodies, points) if live or points else None
+        if new is not None and live:
+            self._animation.live.note_maps(new.maps)
+        return None if new is None else new.points
 
 
 def _channel_of(key: str, person: int) -> str:

@@ -89,6 +89,11 @@ class StreamState:
         )
 
     @property
+    def live(self) -> float:
+        """How much the mesh on screen follows maps, 0..1."""
+        return 0.0 if self.frame is None else self.frame.live
+
+    @property
     def region_sigma(self) -> dict[str, float]:
         """σ_r of the pose on screen by region, without those that were not seen."""
         if self.frame is None or self.frame.region_sigma is None:

@@ -12,17 +12,17 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from common.body.live_surface import NO_OFFSET, live_surface
+from common.body.live_surface import NO_OFFSET, live_surface, vertex_colours
 from common.body.rigged_mesh import RiggedMesh
 from common.body.skeleton import Skeleton
 from common.body.skeleton_pose import SkeletonPose, forward_kinematics
 from common.body.skinning import animate
 from common.geometry.camera_model import Camera
-from common.geometry.rasterizer import render
 from common.wire.body_message import quantized_skeleton
 from common.wire.residual_packet import decode_residual_header
 from common.wire.skeleton_packet import quantized_pose
 from receiver.residual_decoder import ResidualDecoder, ResidualMaps
+from receiver.viewer.offscreen_viewer import render_live
 from scripts.capture_files import CapturedFrame
 from scripts.fidelity import Picture
 from scripts.fidelity_capture import FRAME_NS, FRAME_RATE_HZ
@@ -106,23 +106,9 @@ def live_picture(
     cameras: list[Camera],
 ) -> list[Picture]:
     """A mesh moved to ``T_world_link`` that follows maps, seen by the cameras: texture plus the vertices' offsets."""
-    vertices = animate(mesh, motion)
-    colours = vertex_colours(mesh)
-    moved, offsets = live_surface(maps.layout, maps.maps, T_world_link, mesh.vertex_link, vertices, colours)
-    shape = vertices if followed == "colour" else moved
-    pictures = []
-    for camera in cameras:
-        colour, depth = render(shape, mesh.faces_drawn, mesh.mesh.surface, camera)
-        if followed != "shape":
-            offset, _ = render(shape, mesh.faces_drawn, offsets, camera, background=NO_OFFSET)
-            colour = np.clip(colour.astype(np.int16) + offset - NO_OFFSET, 0, 255).astype(np.uint8)
-        pictures.append((colour, depth))
-    return pictures
-
-
-def vertex_colours(mesh: RiggedMesh) -> NDArray[np.uint8]:
-    """The texture's colour (V, 3) at each vertex."""
-    height, width = mesh.mesh.texture.shape[:2]
-    u = (mesh.mesh.uv[:, 0] * width).astype(np.int32).clip(0, width - 1)
-    v = (mesh.mesh.uv[:, 1] * height).astype(np.int32).clip(0, height - 1)
-    return np.ascontiguousarray(mesh.mesh.texture[v, u])
+    vertices, colours = animate(mesh, motion), vertex_colours(mesh.mesh)
+    surface = live_surface(mesh.pose_id, maps.layout, maps.maps, T_world_link, mesh.vertex_link, vertices, colours)
+    moved, offsets = surface.follow(T_world_link, mesh.vertex_link, vertices)
+    if followed == "shape":
+        offsets = np.full_like(offsets, NO_OFFSET)
+    return [render_live(mesh, vertices if followed == "colour" else moved, offsets, camera) for camera in cameras]

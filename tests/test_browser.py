@@ -16,16 +16,30 @@ from aiohttp.test_utils import TestServer, unused_port
 from numpy.typing import NDArray
 
 from common.body.body_regions import REGION_COUNT
+from common.body.cylindrical_map import closed, project_points
+from common.body.live_surface import live_surface, vertex_colours
+from common.body.map_layout import map_layout
 from common.body.rigged_mesh import RiggedMesh, build_rigged_mesh
-from common.body.skinning import Skinning
+from common.body.skeleton_pose import forward_kinematics
+from common.body.skinning import Skinning, animate
 from common.body.view import View
 from common.geometry.camera_model import Camera
 from common.geometry.rasterizer import render
 from common.geometry.rigid_transform import look_at
 from receiver.viewer.offscreen_viewer import OffscreenViewer
-from receiver.viewer.viewer import ConnectionState, ViewerStatus, ViewMode
+from receiver.viewer.viewer import ConnectionState, ShownFrame, ViewerStatus, ViewMode
 from receiver.viewer.web_viewer import PAGE_FOLDER, WebViewer
-from tests.capsule_person import SHIRT, SKIN, TROUSERS, capsule_person, link_points, shown_frame
+from tests.capsule_person import (
+    SHIRT,
+    SKELETON,
+    SKIN,
+    TROUSERS,
+    capsule_person,
+    link_points,
+    pose_at,
+    shown_frame,
+)  # fmt: skip
+from tests.changing_shirt import RED, SHIRT_LINKS
 from tests.chromium import Page, find_chromium, open_page
 
 pytestmark = [
@@ -138,11 +152,67 @@ async def test_page_and_offscreen_renderer_agree(skinning: Skinning, person: Rig
     offscreen.add_pose(person)
     offscreen.show(frame)
     expected = offscreen.render([camera])[0][0]
-    room = (picture[..., 0] < 78) & (picture[..., 2] < 112)  # dark grey, as nothing of the person is
-    picture[room] = 255
-    error = (picture.astype(float) - expected) ** 2
-    assert 10 * np.log10(255**2 / error.mean()) >= 35
+    assert difference_db(picture, expected) >= 35
     assert page.problems == []
+
+
+def following(person: RiggedMesh, time_s: float, strength: float) -> ShownFrame:
+    """The person at that time, whose shirt has turned red and is 2 cm wider, in stripes."""
+    frame = shown_frame(person, time_s)
+    assert frame.motion is not None
+    T_world_link = forward_kinematics(SKELETON, pose_at(time_s))
+    vertices, colours = animate(person, frame.motion), vertex_colours(person.mesh)
+    shirt = np.isin(person.vertex_link, SHIRT_LINKS)
+    newer, wider = colours.copy(), vertices.copy()
+    newer[shirt & (np.sin(60 * vertices[:, 1]) > 0)] = RED
+    wider[shirt] += 0.02 * (vertices[shirt] - vertices[shirt].mean(axis=0)) / 0.15
+    layout = map_layout(SKELETON, 10_000, 60.0)
+    maps = closed(layout, project_points(layout, T_world_link, person.vertex_link, wider, newer))
+    surface = live_surface(7, layout, maps, T_world_link, person.vertex_link, vertices, colours)
+    return dataclasses.replace(frame, surface=surface, live=strength)
+
+
+@pytest.mark.parametrize("strength", [1.0, 0.4])
+async def test_page_and_offscreen_renderer_agree_on_a_live_surface(strength: float) -> None:
+    """The same mesh tinted and moved by the page's shaders and by the offscreen renderer; L on the page switches it."""
+    person = captured_person(7)
+    frame = following(person, 2.3, strength)
+    async with receiver() as (viewer, url), open_page(url, 800, 600) as page:
+        viewer.add_pose(person)
+        viewer.set_status(RECEIVING)
+        viewer.show(frame)
+        await page.press("h")
+        plain = await photograph_when(page, lambda p: coloured(p, SHIRT).sum() > 500)
+        assert not viewer.wants_live
+        await page.press("l")
+        await until(lambda: viewer.wants_live)
+        viewer.show(dataclasses.replace(frame, sequence=1))  # the same pose, and no other mesh
+        picture = await photograph_when(page, lambda p: (p != plain).any(axis=2).sum() > 500)
+        camera = await camera_of(page, 800, 600)
+    errors = {}
+    for mode in get_args(ViewMode)[:2]:
+        offscreen = OffscreenViewer(mode=mode)
+        offscreen.add_pose(person)
+        offscreen.show(frame)
+        for name, seen in (("page plain", plain), ("page live", picture)):
+            errors[mode, name] = difference_db(seen, offscreen.render([camera])[0][0])
+    assert min(errors["live", "page live"], errors["mesh", "page plain"]) >= 35
+    assert errors["mesh", "page live"] < errors["live", "page live"]
+    assert errors["live", "page plain"] < errors["mesh", "page plain"]
+    assert page.problems == []
+
+
+def difference_db(picture: NDArray[np.uint8], expected: NDArray[np.uint8]) -> float:
+    """PSNR of a photograph of the page against a picture on white."""
+    room = (picture[..., 0] < 78) & (picture[..., 2] < 112)  # dark grey, as nothing of the person is
+    error = (np.where(room[..., None], 255, picture).astype(float) - expected) ** 2
+    return float(10 * np.log10(255**2 / error.mean()))
+
+
+async def until(condition: Callable[[], bool]) -> None:
+    async with asyncio.timeout(5):
+        while not condition():  # noqa: ASYNC110
+            await asyncio.sleep(0.02)
 
 
 async def test_page_and_offscreen_renderer_agree_on_points() -> None:
@@ -161,10 +231,7 @@ async def test_page_and_offscreen_renderer_agree_on_points() -> None:
     offscreen.show_points(points)
     offscreen.show(frame)
     expected = offscreen.render([camera])[0][0]
-    room = (picture[..., 0] < 78) & (picture[..., 2] < 112)
-    picture[room] = 255
-    error = (picture.astype(float) - expected) ** 2
-    assert 10 * np.log10(255**2 / error.mean()) >= 40
+    assert difference_db(picture, expected) >= 40
     assert page.problems == []
 
 
@@ -177,9 +244,7 @@ async def test_points_are_moved_switched_and_gone() -> None:
         await page.press("p")
         await photograph_when(page, lambda p: coloured(p, SHIRT).sum() == 0)
         assert "No points yet" in await page.evaluate(note)
-        async with asyncio.timeout(5):
-            while not viewer.wants_points:  # noqa: ASYNC110
-                await asyncio.sleep(0.02)
+        await until(lambda: viewer.wants_points)
         viewer.show_points(link_points(person))
         first = await photograph_when(page, lambda p: coloured(p, SHIRT).sum() > 500)
         await photograph_when(page, lambda p: (coloured(p, SKIN) ^ coloured(first, SKIN)).sum() > 200)  # they move

@@ -19,7 +19,7 @@ from scripts.daemon_processes import Running, Site, free_port, site
 
 SHOWN, PUBLISHED = "telepose_frames_shown_total", "telepose_skeletons_published_total"
 POSES = "telepose_repository_poses"
-POINTS = "telepose_points_shown_total"
+MAPS, LIVE = "telepose_maps_decoded_total", "telepose_live_surface"
 SMALL_RIG = ("--width", "320", "--height", "240", "--fps", "15")  # leaves the test machine time for the rest
 
 
@@ -55,16 +55,18 @@ def test_a_person_gets_through_and_both_ends_leave_cleanly(here):
     assert (last < 200).any(axis=2).sum() > 8000  # a body, not bones
 
 
-def test_points_get_through_to_whoever_shows_them_and_come_back(here):
+def test_maps_get_through_to_whoever_shows_them_and_come_back(here):
     here.rig(*SMALL_RIG)
     sender = here.sender()
     sender.wait_for(PUBLISHED, 10)
     assert sender.metric("telepose_residual_packets_sent_total") == 0
     of_points = here.receiver("--points", name="points")
-    of_points.wait_for(POINTS, 10)
+    of_points.wait_for(MAPS, 10)
     sender.wait_for("telepose_residual_level", 100)  # loopback has room for all
     of_points.end(signal.SIGKILL)
-    here.receiver("--points", name="again").wait_for(POINTS, 5)
+    live = here.receiver("--live", name="again")
+    live.wait_for(MAPS, 5)
+    live.wait_for(LIVE, 1)  # and the mesh on screen follows them
 
 
 def test_a_killed_receiver_comes_back_to_the_picture(here):

@@ -30,8 +30,9 @@ def outward_of_axis(link: int) -> np.ndarray:
     return (local / np.linalg.norm(local, axis=1, keepdims=True)) @ LAYOUT.cylinders[link] @ R.T
 
 
-def follow(maps: LinkMaps, colours: np.ndarray = GREY) -> tuple[np.ndarray, np.ndarray]:
-    return live_surface(LAYOUT, maps, T_WORLD_LINK, LINKS, CLOUD.positions, colours)
+def follow(maps: LinkMaps, colours: np.ndarray = GREY, strength: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
+    surface = live_surface(1, LAYOUT, maps, T_WORLD_LINK, LINKS, CLOUD.positions, colours)
+    return surface.follow(T_WORLD_LINK, LINKS, CLOUD.positions, strength)
 
 
 def test_maps_of_the_mesh_itself_change_nothing() -> None:
@@ -62,6 +63,35 @@ def test_a_face_that_turns_red_does_so_on_the_mesh_and_nowhere_else() -> None:
     assert got[1] == 0
     assert -40 <= got[2] <= -30
     assert (offsets[~mine] == NO_OFFSET).all()
+
+
+def test_of_less_strength_is_the_part() -> None:
+    mine = LINK_INDEX["head"] == LINKS
+    red, newer = GREY.copy(), CLOUD.positions.copy()
+    red[mine] = [160, 100, 60]
+    newer[mine] += 0.02 * outward_of_axis(LINK_INDEX["head"]).astype(np.float32)
+    maps = maps_of(newer, red)
+    (whole, red_offsets), (half, pink_offsets) = follow(maps), follow(maps, strength=0.5)
+    np.testing.assert_allclose(half, (whole + CLOUD.positions) / 2, atol=1e-4)
+    np.testing.assert_allclose(pink_offsets - 128.0, (red_offsets - 128.0) / 2, atol=1)
+    unmoved, no_offsets = follow(maps, strength=0.0)
+    np.testing.assert_array_equal(unmoved, CLOUD.positions)
+    assert (no_offsets == NO_OFFSET).all()
+
+
+def test_it_stays_on_the_surface_when_the_links_move_on() -> None:
+    link = LINK_INDEX["left_forearm"]
+    mine = link == LINKS
+    newer = CLOUD.positions.copy()
+    newer[mine] += 0.02 * outward_of_axis(link).astype(np.float32)
+    surface = live_surface(1, LAYOUT, maps_of(newer, GREY), T_WORLD_LINK, LINKS, CLOUD.positions, GREY)
+    here, _ = surface.follow(T_WORLD_LINK, LINKS, CLOUD.positions)
+    later = forward_kinematics(BODY, pose_at(1.7))
+    moved_on, _ = posed_cloud(pose_at(1.7), 8000)
+    there, _ = surface.follow(later, LINKS, moved_on.positions)
+    went_m = np.linalg.norm(here - CLOUD.positions, axis=1)
+    np.testing.assert_allclose(np.linalg.norm(there - moved_on.positions, axis=1), went_m, atol=5e-4)
+    assert np.median(went_m[mine]) > 0.014
 
 
 def test_another_surface_is_not_followed() -> None:

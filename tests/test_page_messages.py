@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import struct
+from typing import get_args
 
 import cv2
 import numpy as np
@@ -19,7 +20,7 @@ from common.body.skinning import captured_joints
 from common.body.vertex_blend import VertexBlend
 from common.geometry.triangle_mesh import TriangleMesh
 from receiver.viewer import page_messages
-from receiver.viewer.viewer import ConnectionState, ViewerStatus
+from receiver.viewer.viewer import ConnectionState, ViewerStatus, ViewMode
 from tests.capsule_person import SKELETON, capsule_person, link_points, shown_frame
 from tests.capsule_views import arms_down_by, capsule_views
 
@@ -177,8 +178,8 @@ def test_no_points_are_a_message_too() -> None:
 
 
 @pytest.mark.parametrize("text", ["", "Points", "mesh ", "x" * 1000])
-def test_a_mode_is_one_of_two_or_refused(text: str) -> None:
-    assert [page_messages.decode_mode(mode) for mode in ("mesh", "points")] == ["mesh", "points"]
+def test_a_mode_is_one_of_three_or_refused(text: str) -> None:
+    assert [page_messages.decode_mode(mode) for mode in get_args(ViewMode)] == ["mesh", "live", "points"]
     with pytest.raises(ValueError, match="wants to show"):
         page_messages.decode_mode(text)
 

@@ -18,12 +18,14 @@ import pytest
 from aiohttp import web
 from aiohttp.test_utils import TestServer
 
+from common.body.live_surface import LiveSurface
+from common.body.map_layout import map_layout
 from common.body.rigged_mesh import RiggedMesh
 from receiver.viewer import page_messages, web_viewer
-from receiver.viewer.page_messages import FRAME, POINTS, POSE, REMOVE
+from receiver.viewer.page_messages import FRAME, LIVE, POINTS, POSE, REMOVE
 from receiver.viewer.viewer import ConnectionState, ViewerStatus
 from receiver.viewer.web_viewer import MESSAGES_UNDER_WAY, WebViewer
-from tests.capsule_person import capsule_person, link_points, shown_frame
+from tests.capsule_person import SKELETON, capsule_person, link_points, shown_frame
 
 LIMIT_S = 10.0
 PERSON = capsule_person(pose_id=1)
@@ -199,6 +201,23 @@ async def test_points_go_to_pages_that_show_them_newest_first() -> None:
         assert await of_points.binaries(1) == [(POINTS, 0)]
         await of_points.socket.send_str("mesh")
         await until(lambda: not served.viewer.wants_points)
+
+
+async def test_what_maps_show_goes_once_to_pages_that_show_it_before_its_frame() -> None:
+    layout = map_layout(SKELETON, 1000, 25.0)
+    offsets = np.full((layout.height, layout.width, 4), 128, np.uint8)
+    frame = shown_frame(PERSON, 0.0, 5)
+    frame = dataclasses.replace(frame, surface=LiveSurface(1, layout, offsets), live=0.5)
+    async with serve() as served, served.page() as of_mesh, served.page() as live:
+        await live.socket.send_str("live")
+        await until(lambda: served.viewer.wants_live)
+        served.viewer.show(frame)
+        assert await live.binaries(2) == [(LIVE, 1), (FRAME, 5)]
+        served.viewer.show(dataclasses.replace(frame, sequence=6))
+        assert await live.binaries(1) == [(FRAME, 6)]
+        assert (FRAME, 6) in await of_mesh.binaries(2)
+        await live.socket.send_str("mesh")
+        await until(lambda: not served.viewer.wants_live)
 
 
 async def test_pose_id_used_again_is_uploaded_again() -> None:

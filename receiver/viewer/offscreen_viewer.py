@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from common.body.link_points import SPLAT_RADIUS_M, LinkPoints
+from common.body.live_surface import NO_OFFSET
 from common.body.skinning import Skinning, animate
 from common.geometry.camera_model import Camera
 from common.geometry.point_splats import render_points
@@ -89,6 +90,9 @@ class OffscreenViewer:
         frame, mesh = on_screen
         assert frame.motion is not None  # as its pose is not
         vertices = animate(mesh, frame.motion, self._skinning)
+        if self._mode == "live" and frame.surface is not None and frame.links is not None:
+            moved, offsets = frame.surface.follow(frame.links, mesh.vertex_link, vertices, frame.live)
+            return [render_live(mesh, moved, offsets, camera) for camera in cameras]
         return [render(vertices, mesh.faces_drawn, mesh.mesh.surface, camera, BACKGROUND) for camera in cameras]
 
     def _render_points(self, cameras: Sequence[Camera]) -> list[tuple[NDArray[np.uint8], NDArray[np.float32]]]:
@@ -97,6 +101,15 @@ class OffscreenViewer:
             return [_nobody(camera) for camera in cameras]
         positions = points.posed(frame.links)
         return [render_points(positions, points.colours, camera, SPLAT_RADIUS_M, BACKGROUND) for camera in cameras]
+
+
+def render_live(
+    mesh: RiggedMesh, vertices: NDArray[np.float32], offsets: NDArray[np.uint8], camera: Camera
+) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
+    """Colour and depth as ``render``'s, of the texture with colour ``offsets`` (V, 3) about ``NO_OFFSET`` on it."""
+    colour, depth = render(vertices, mesh.faces_drawn, mesh.mesh.surface, camera, BACKGROUND)
+    offset, _ = render(vertices, mesh.faces_drawn, offsets, camera, NO_OFFSET)
+    return np.clip(colour.astype(np.int16) + offset - NO_OFFSET, 0, 255).astype(np.uint8), depth
 
 
 def _nobody(camera: Camera) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:

@@ -39,7 +39,7 @@ async def follow(page: str) -> AsyncGenerator[PageView, None]:
             aiohttp.ClientSession(timeout=timeout) as session,
             session.ws_connect(socket_address(page), max_msg_size=MESSAGE_MAX_BYTES) as socket,
         ):
-            await socket.send_str("mesh")  # points would be sent in vain
+            await socket.send_str("mesh")  # more would be sent in vain
             async for message in socket:
                 if message.type is aiohttp.WSMsgType.BINARY:
                     view.take(message.data)

@@ -9,14 +9,18 @@ four bytes, so that the page reads typed arrays in place (``web/src/messages.js`
   in 1/255), ``joints f32[L, 3]`` at capture, ``index u16[F, 3]`` (u32 if V > 65,536), padding, and the texture as JPEG.
 - FRAME, every skeleton: ``pose_id u32, sequence u32, sigma f32, fit_confidence f32, age_ms f32, motion f32[L, 3, 4],
   joints f32[L, 3], links f32[L, 3, 4], confidence u8[L]``, padding: 2,532 bytes, 0.61 Mbit/s at 30 Hz. The first of its
-  two zero bytes is 1 when it is withheld: the last good picture once more. ``links`` (T_world_link) move points.
+  two zero bytes is 1 when it is withheld: the last good picture once more; the second, how much of the newest LIVE of
+  the same pose it shows, in 1/255. ``links`` (T_world_link) move points, and tell where in LIVE a vertex is.
 - REMOVE: ``pose_id u32``.
 - POINTS, every residual packet, to pages that show points: ``points N u32, box_min f32[3], box_size f32[3], radius f32,
   position u16[N, 3]`` (0..65535 over the box, in the frame of the point's link), padding, ``colour and link u8[N, 4]``:
   10 bytes a point. With N = 0 there are none any more.
+- LIVE, when there is a newer one, before the FRAME that shows it, to pages that show it: ``pose_id u32, width W u32,
+  height H u32, step f32, cylinders f32[L, 3, 3], sizes f32[L, 2], places i32[L, 4]`` (as in ``MapLayout``), ``offsets
+  u8[H, W, 4]`` about 128: red, green, blue, and outwards in ``step`` [m]. 60 kB, ten times a second.
 
 The page answers each binary message with one ``u32``: how many it has taken in so far. What it shows, where that is not
-HELLO's ``mode``, it says as the text "points" or "mesh".
+HELLO's ``mode``, it says as the text "mesh", "live" or "points".
 """
 
 from __future__ import annotations
@@ -25,13 +29,14 @@ import json
 import math
 import struct
 from dataclasses import asdict
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast, get_args
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from common.body.link_points import SPLAT_RADIUS_M, LinkPoints
+from common.body.live_surface import OUTWARD_STEP_M, LiveSurface
 from common.body.skeleton import LINK_COUNT, LINK_PARENTS
 from common.body.skinning import Skinning, captured_joints
 from receiver.viewer.viewer import ShownFrame, ViewerStatus, ViewMode
@@ -39,8 +44,8 @@ from receiver.viewer.viewer import ShownFrame, ViewerStatus, ViewMode
 if TYPE_CHECKING:
     from common.body.rigged_mesh import RiggedMesh
 
-VERSION = 5
-POSE, FRAME, REMOVE, POINTS = 1, 2, 3, 4
+VERSION = 6
+POSE, FRAME, REMOVE, POINTS, LIVE = 1, 2, 3, 4, 5
 NO_POSE = 0xFFFFFFFF
 QUANTIZATION_STEPS = 65535
 SHORT_INDEX_VERTICES = 65536
@@ -48,11 +53,12 @@ JPEG_QUALITY = 90  # above the received views' own: a second coding should add l
 TEXTURE_SIDE_MAX = 8192  # pixels; what browsers' GPUs take
 
 _HEADER = struct.Struct("<BBxx")
-_FRAME_HEADER = struct.Struct("<BB?x")
+_FRAME_HEADER = struct.Struct("<BB?B")
 _POSE = struct.Struct("<III3f3f")
 _FRAME = struct.Struct("<IIfff")
 _REMOVE = struct.Struct("<I")
 _POINTS = struct.Struct("<I3f3ff")
+_LIVE = struct.Struct("<IIIf")
 _ACKNOWLEDGEMENT = struct.Struct("<I")
 
 
@@ -91,7 +97,7 @@ def encode_frame(frame: ShownFrame) -> bytes:
     confidence = np.rint(np.clip(frame.confidence, 0, 1) * 255).astype(np.uint8)
     links = np.zeros((LINK_COUNT, 3, 4), np.float32) if frame.links is None else frame.links
     parts = (
-        _FRAME_HEADER.pack(VERSION, FRAME, frame.withheld),
+        _FRAME_HEADER.pack(VERSION, FRAME, frame.withheld, round(255 * frame.live)),
         head,
         _floats(motion),
         _floats(frame.joints),
@@ -111,6 +117,14 @@ def encode_points(points: LinkPoints | None) -> bytes:
     colour = np.concatenate([points.colours, points.links[:, None]], axis=1)
     head = _HEADER.pack(VERSION, POINTS) + _POINTS.pack(len(points), *box_min, *box_size, SPLAT_RADIUS_M)
     return b"".join((head, _padded(position.tobytes()), colour.tobytes()))
+
+
+def encode_live(surface: LiveSurface) -> bytes:
+    """The LIVE message."""
+    layout, (height, width) = surface.layout, surface.offsets.shape[:2]
+    parts = (_floats(layout.cylinders), _floats(layout.sizes), layout.places.astype("<i4").tobytes())
+    head = _HEADER.pack(VERSION, LIVE) + _LIVE.pack(surface.pose_id, width, height, OUTWARD_STEP_M)
+    return b"".join((head, *parts, surface.offsets.tobytes()))
 
 
 def encode_remove(pose_id: int) -> bytes:
@@ -146,12 +160,11 @@ def decode_mode(message: str) -> ViewMode:
     """What the page shows from now on.
 
     Raises:
-        ValueError: neither of the two.
+        ValueError: none of the three.
     """
-    if message == "mesh":
-        return "mesh"
-    if message == "points":
-        return "points"
+    for mode in get_args(ViewMode):
+        if message == mode:
+            return cast(ViewMode, mode)
     raise ValueError(f"it wants to show {message[:20]!r}")
 
 

@@ -21,6 +21,7 @@ from common.body.vertex_blend import VertexBlend
 from common.geometry.triangle_mesh import TriangleMesh
 from receiver.viewer.page_messages import (
     FRAME,
+    LIVE,
     NO_POSE,
     POINTS,
     POSE,
@@ -118,7 +119,7 @@ class PageView:
             raise ValueError(f"not a message of a page: {text[:40]!r}") from error
 
     def take(self, message: bytes) -> None:
-        """POSE, FRAME or REMOVE; POINTS are not shown here.
+        """POSE, FRAME or REMOVE; POINTS and LIVE are not shown here.
 
         Raises:
             ValueError: malformed.
@@ -137,7 +138,7 @@ class PageView:
             self._show(self._frame)
         elif kind == REMOVE:
             self._remove(struct.unpack_from("<I", message, 4)[0])
-        elif kind != POINTS:
+        elif kind not in (POINTS, LIVE):
             raise ValueError(f"a page message of kind {kind}")
 
     def _show(self, frame: PageFrame) -> None:

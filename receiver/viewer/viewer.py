@@ -18,9 +18,10 @@ from common.body.skeleton import LINK_COUNT
 
 if TYPE_CHECKING:
     from common.body.link_points import LinkPoints
+    from common.body.live_surface import LiveSurface
     from common.body.rigged_mesh import RiggedMesh
 
-ViewMode = Literal["mesh", "points"]
+ViewMode = Literal["mesh", "live", "points"]
 
 
 class ConnectionState(StrEnum):
@@ -40,6 +41,7 @@ class ShownFrame:
     ``motion`` (L, 3, 4) float32: T_world_link(now) · T_link_world(at capture), moves the mesh's world vertices.
     ``joints`` (L, 3) float32 [m, world]: link origins. ``sigma``: distortion score σ of the drawn pose (nan: none).
     ``links`` (L, 3, 4) float32: T_world_link, moves points; None where nobody needs it.
+    ``surface``: what maps show beyond that mesh, None: nothing; ``live``: how much of it to show, 0..1.
     ``region_sigma`` (R,) float32: its σ_r by region (``REGION_NAMES``; nan: not seen), None without a pose.
     ``fit_confidence``: 0..1. ``confidence`` (L,) float32: 0 = that link was not seen.
     ``age_ms``: time from capture to this call [ms], nan while the clock offset to the sender is unknown.
@@ -56,6 +58,8 @@ class ShownFrame:
     joints: NDArray[np.float32]
     sigma: float
     links: NDArray[np.float32] | None = field(default=None, kw_only=True)
+    surface: LiveSurface | None = field(default=None, kw_only=True)
+    live: float = field(default=0.0, kw_only=True)
     region_sigma: NDArray[np.float32] | None = field(default=None, kw_only=True)
     fit_confidence: float
     confidence: NDArray[np.float32]
@@ -65,6 +69,8 @@ class ShownFrame:
     def __post_init__(self) -> None:
         if (self.pose_id is None) != (self.motion is None):
             raise ValueError("a shown frame has a pose and its motion, or neither")
+        if self.surface is not None and self.surface.pose_id != self.pose_id:
+            raise ValueError(f"a surface of pose {self.surface.pose_id} in a frame of pose {self.pose_id}")
         if self.motion is not None and self.motion.shape != (LINK_COUNT, 3, 4):
             raise ValueError(f"motion: expected {(LINK_COUNT, 3, 4)}, got {self.motion.shape}")
         if self.links is not None and self.links.shape != (LINK_COUNT, 3, 4):
@@ -96,8 +102,8 @@ class ViewerStatus:
 
 
 class Viewer(Protocol):
-    """Shows one person, as a mesh or as points. Poses are added before the first frame that names them;
-    ``show_points``: the points that frames move from now on, None: there are none."""
+    """Shows one person, as a mesh, as a mesh that follows maps ("live") or as points. Poses are added before the first
+    frame that names them; ``show_points``: the points that frames move from now on, None: there are none."""
 
     def add_pose(self, mesh: RiggedMesh) -> None: ...
     def remove_pose(self, pose_id: int) -> None: ...

@@ -24,6 +24,7 @@ from receiver.viewer.page_messages import (
     decode_mode,
     encode_frame,
     encode_hello,
+    encode_live,
     encode_points,
     encode_pose,
     encode_remove,
@@ -33,6 +34,7 @@ from receiver.viewer.viewer import ShownFrame, ViewerStatus, ViewMode
 
 if TYPE_CHECKING:
     from common.body.link_points import LinkPoints
+    from common.body.live_surface import LiveSurface
     from common.body.rigged_mesh import RiggedMesh
 
 log = logging.getLogger(__name__)
@@ -77,6 +79,8 @@ class WebViewer:
         self._points: LinkPoints | None = None
         self._points_message: bytes | None = None  # of these points, once a page needed it
         self._frame: bytes | None = None
+        self._surface: LiveSurface | None = None  # of that frame
+        self._surface_message: bytes | None = None  # of that surface, once a page needed it
         self._pose_on_screen: int | None = None
         self._status = encode_status(ViewerStatus())
         self._pages: set[_Page] = set()
@@ -90,6 +94,11 @@ class WebViewer:
     def wants_points(self) -> bool:
         """Whether a page shows points."""
         return any(page.mode == "points" for page in self._pages)
+
+    @property
+    def wants_live(self) -> bool:
+        """Whether a page shows a mesh that follows maps."""
+        return any(page.mode == "live" for page in self._pages)
 
     def add_pose(self, mesh: RiggedMesh) -> None:
         """Uploads the mesh to every page once; one that cannot be shown (too large a texture) is logged."""
@@ -111,6 +120,8 @@ class WebViewer:
     def show(self, frame: ShownFrame) -> None:
         """Newest wins: a page that is not ready for this frame will get a later one."""
         self._frame = encode_frame(frame)
+        if frame.surface is not self._surface:
+            self._surface, self._surface_message = frame.surface, None
         self._pose_on_screen = frame.pose_id
         self._wake()
 
@@ -202,6 +213,10 @@ class WebViewer:
             page.points = self._points
             self._points_message = self._points_message or encode_points(self._points)
             await page.send(self._points_message)
+        if page.mode == "live" and self._surface is not None and page.surface is not self._surface:
+            page.surface = self._surface
+            self._surface_message = self._surface_message or encode_live(self._surface)
+            await page.send(self._surface_message)
         if self._frame is not None and page.frame is not self._frame:
             page.frame = self._frame
             await page.send(page.frame)
@@ -244,6 +259,7 @@ class _Page:
         self.socket = socket
         self.mode = mode
         self.points: LinkPoints | None = None
+        self.surface: LiveSurface | None = None
         self.wake = asyncio.Event()
         self.poses: set[int] = set()
         self.frame: bytes | None = None

@@ -20,8 +20,9 @@ let newest = null; // the frame to draw next; an older one not drawn yet is skip
 let capturedAt = NaN; // when what is on screen was captured, on this page's clock
 let drawnAt = performance.now();
 let withheld = false; // the last good picture is kept
-let mode = null; // "mesh" or "points": the receiver's choice until somebody's here
+let mode = null; // "mesh", "live" or "points": the receiver's choice until somebody's here
 let chosen = null;
+let surface = "mesh"; // the mode that is not points
 
 const receiver = connect({
   hello({ link_parents, skinning, mode: first }) {
@@ -48,6 +49,9 @@ const receiver = connect({
     points.set(message);
     setMode(mode);
   },
+  live(message) {
+    person.live.set(message);
+  },
   frame(frame) {
     newest = { ...frame, capturedAt: performance.now() - frame.ageMs };
   },
@@ -71,14 +75,16 @@ function openStage(canvas) {
 function setMode(value) {
   mode = value;
   document.body.dataset.mode = mode;
+  if (mode !== "points") surface = mode;
   points.visible = mode === "points";
-  person.visible = mode === "mesh";
+  person.visible = mode !== "points";
+  person.live.wanted = mode === "live";
   hud.setPointsMissing(mode === "points" && !points.any);
   stage.changed = true;
 }
 
 function setPresence() {
-  const held = withheld && mode === "mesh"; // points are shown in every posture
+  const held = withheld && mode !== "points"; // points are shown in every posture
   hud.setWithheld(held && hud.live);
   person.presence = !hud.live ? 0 : held ? WITHHELD_PRESENCE : 1;
   points.presence = hud.live ? 1 : 0;
@@ -106,15 +112,18 @@ requestAnimationFrame(draw);
 
 const KEYS = {
   s: () => skeleton.toggle(),
-  p() {
-    chosen = mode === "points" ? "mesh" : "points";
-    setMode(chosen);
-    setPresence();
-    receiver.send(chosen);
-  },
+  p: () => choose(mode === "points" ? surface : "points"),
+  l: () => choose(mode === "live" ? "mesh" : "live"),
   r: () => stage.front(),
   h: () => document.body.classList.toggle("quiet"),
 };
+
+function choose(value) {
+  chosen = value;
+  setMode(chosen);
+  setPresence();
+  receiver.send(chosen);
+}
 
 function press(key) {
   KEYS[key]?.();

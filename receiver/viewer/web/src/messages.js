@@ -1,7 +1,7 @@
 // The page's end of receiver/viewer/page_messages.py: typed arrays read in place, little-endian.
 
-export const VERSION = 5;
-const KINDS = { 1: decodePose, 2: decodeFrame, 3: decodeRemove, 4: decodePoints };
+export const VERSION = 6;
+const KINDS = { 1: decodePose, 2: decodeFrame, 3: decodeRemove, 4: decodePoints, 5: decodeLive };
 const NO_POSE = 0xffffffff;
 export const LINKS = 23;
 
@@ -41,6 +41,7 @@ function decodeFrame(buffer, view) {
     kind: "frame",
     poseId: poseId === NO_POSE ? null : poseId,
     withheld: view.getUint8(2) === 1,
+    live: view.getUint8(3) / 255,
     ageMs: view.getFloat32(20, true),
     motion: new Float32Array(buffer, 24, LINKS * 12),
     joints: new Float32Array(buffer, 24 + LINKS * 48, LINKS * 3),
@@ -63,6 +64,22 @@ function decodePoints(buffer, view) {
     radius: view.getFloat32(32, true),
     positions: new Uint16Array(buffer, 36, count * 3),
     colours: new Uint8Array(buffer, 36 + align(count * 6), count * 4),
+  };
+}
+
+function decodeLive(buffer, view) {
+  const sizes = 20 + LINKS * 36;
+  const places = sizes + LINKS * 8;
+  return {
+    kind: "live",
+    poseId: view.getUint32(4, true),
+    width: view.getUint32(8, true),
+    height: view.getUint32(12, true),
+    step: view.getFloat32(16, true),
+    cylinders: new Float32Array(buffer, 20, LINKS * 9),
+    sizes: new Float32Array(buffer, sizes, LINKS * 2),
+    places: new Int32Array(buffer, places, LINKS * 4),
+    offsets: new Uint8Array(buffer, places + LINKS * 16),
   };
 }
 

@@ -1,7 +1,8 @@
 // The person: each candidate pose's mesh and texture are on the GPU once; a frame moves it by one rigid motion per link,
-// mixed at the joints as common/body/skinning.py does.
+// mixed at the joints as common/body/skinning.py does. Where it is to follow newer maps, live.js moves and tints it.
 
 import * as THREE from "three";
+import { followingShader, LiveSurface } from "./live.js";
 import { LINKS } from "./messages.js";
 
 const SKINNINGS = ["rigid", "linear", "spherical"];
@@ -15,7 +16,7 @@ const vertexShader = /* glsl */ `
   uniform vec3 joint[${LINKS}];  // at capture
   in vec4 skin;  // link, neighbour, joint between them, the neighbour's part in 1/255
   out vec2 at;
-
+${followingShader}
   vec3 moved(int link, vec3 point) {
     vec4 p = vec4(point, 1.0);
     return vec3(dot(motion[3 * link], p), dot(motion[3 * link + 1], p), dot(motion[3 * link + 2], p));
@@ -35,7 +36,8 @@ const vertexShader = /* glsl */ `
 
   void main() {
     at = uv;
-    gl_Position = projectionMatrix * viewMatrix * vec4(now(boxMin + boxSize * position), 1.0);
+    vec3 here = following(int(skin.x + 0.5), now(boxMin + boxSize * position));
+    gl_Position = projectionMatrix * viewMatrix * vec4(here, 1.0);
   }`;
 
 // Unlit: the cameras' colours already hold the light of the room.
@@ -43,10 +45,11 @@ const fragmentShader = /* glsl */ `
   uniform sampler2D atlas;
   uniform float presence;
   in vec2 at;
+  in vec3 tint;
   out vec4 colour;
 
   void main() {
-    vec3 shade = texture(atlas, at).rgb;
+    vec3 shade = clamp(texture(atlas, at).rgb + tint, 0.0, 1.0);
     vec3 faded = mix(vec3(dot(shade, vec3(0.3, 0.59, 0.11)) * 0.45), shade, presence);
     colour = vec4(faded, 1.0);
   }`;
@@ -57,7 +60,9 @@ export class Person {
     scene.add(this.group);
     this.meshes = new Map(); // of all poses; those in the group can be shown
     this.frame = null; // the last one to show
+    this.live = new LiveSurface();
     this.shared = {
+      ...this.live.uniforms,
       skinning: { value: 0 },
       motion: { value: new Float32Array(12 * LINKS) },
       turn: { value: Array.from({ length: LINKS }, () => new THREE.Quaternion()) },
@@ -91,6 +96,7 @@ export class Person {
   clear() {
     for (const poseId of [...this.meshes.keys()]) this.remove(poseId);
     this.frame = null;
+    this.live.clear();
   }
 
   /** Shows the frame's pose, nobody if it has none; while its mesh is not ready yet the last one stays as it was. */
@@ -100,6 +106,7 @@ export class Person {
     if (poseId !== null && !this.meshes.get(poseId)?.parent) return;
     this.shared.motion.value.set(motion);
     this.shared.turn.value.forEach((turn, link) => turn.setFromRotationMatrix(matrixOf(motion, link)));
+    this.live.show(frame);
     for (const [id, mesh] of this.meshes) mesh.visible = id === poseId;
   }
 

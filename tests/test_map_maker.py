@@ -1,4 +1,4 @@
-"""Packets become points on a thread; a receiver that is behind shows the newest, and junk is counted."""
+"""Packets become maps on a thread, and points if wanted; one that is behind shows the newest, and junk is counted."""
 
 from __future__ import annotations
 
@@ -6,11 +6,10 @@ import asyncio
 import threading
 from collections.abc import Callable
 
-from common.body.link_points import LinkPoints
 from common.runtime.clock import ManualClock
 from common.runtime.stage_timer import StageTimer
-from receiver.pipeline import PointPath
-from receiver.point_maker import WAITING, PointMaker
+from receiver.map_maker import WAITING, MapMaker
+from receiver.pipeline import MapPath, NewMaps
 from tests.posed_cloud import BODY
 from tests.test_residual_stream import encoder, sent
 
@@ -21,18 +20,20 @@ class Made:
     """A maker with what it showed; ``go_on`` lets its thread work."""
 
     def __init__(self) -> None:
-        self.shown: list[LinkPoints] = []
+        self.shown: list[NewMaps] = []
+        self.wants_points = True
         self.go_on = threading.Event()
         self.go_on.set()
-        path = PointPath(0, StageTimer(ManualClock()))
+        path = MapPath(0, StageTimer(ManualClock()))
         take = path.take
 
-        def when_let(*arguments: object) -> LinkPoints | None:
+        def when_let(*arguments: object) -> NewMaps | None:
             assert self.go_on.wait(10)
             return take(*arguments)  # type: ignore[arg-type]
 
         path.take = when_let  # type: ignore[method-assign]
-        self.maker = PointMaker(path, lambda epoch: {5: BODY} if epoch == EPOCH else {}, self.shown.append)
+        bodies = {EPOCH: {5: BODY}}
+        self.maker = MapMaker(path, lambda epoch: bodies.get(epoch, {}), lambda: self.wants_points, self.shown.append)
 
 
 async def until(condition: Callable[[], bool]) -> None:
@@ -48,7 +49,14 @@ async def test_each_packet_is_shown_by_one_that_keeps_up():
         made.maker.submit(packet)
         await until(lambda number=number: made.maker.made > number)
     assert len(made.shown) == 4
-    assert len(made.shown[-1]) > 500
+    points = made.shown[-1].points
+    assert points is not None
+    assert len(points) > 500
+    made.wants_points = False
+    made.maker.submit(sent(encoder(), range(5))[4])
+    await until(lambda: made.maker.made == 5)
+    assert made.shown[-1].points is None
+    assert made.shown[-1].maps.header.sequence == 4
     running.cancel()
     made.maker.close()
 

@@ -1,4 +1,4 @@
-"""Residual packets into points, beside the loop: on a thread of its own, since a mesh takes as long as ten frames."""
+"""Residual packets into maps, beside the loop: on a thread of its own, since a mesh takes as long as ten frames."""
 
 from __future__ import annotations
 
@@ -8,34 +8,35 @@ from collections import Counter
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 
-from common.body.link_points import LinkPoints
 from common.body.skeleton import Skeleton
 from common.wire.header import WireError
 from common.wire.residual_packet import needed_packets
-from receiver.pipeline import PointPath
+from receiver.pipeline import MapPath, NewMaps
 
 log = logging.getLogger(__name__)
 
 WAITING = 8
 
 
-class PointMaker:
-    """``bodies(epoch)``: sizes by revision; ``show``: called on the loop with the newest points. ``made``: how many
-    packets became points; ``counts``: those that did not, by cause."""
+class MapMaker:
+    """``bodies(epoch)``: sizes by revision; ``wants_points()``: whether somebody is shown points; ``show``: called on
+    the loop with the newest maps. ``made``: how many packets became maps; ``counts``: those that did not, by cause."""
 
     def __init__(
         self,
-        path: PointPath,
+        path: MapPath,
         bodies: Callable[[int], Mapping[int, Skeleton]],
-        show: Callable[[LinkPoints], None],
+        wants_points: Callable[[], bool],
+        show: Callable[[NewMaps], None],
     ) -> None:
         self.made = 0
         self._path = path
         self._bodies = bodies
+        self._wants_points = wants_points
         self._show = show
         self._counts: Counter[str] = Counter()
         self._packets: asyncio.Queue[bytes] = asyncio.Queue(WAITING)
-        self._thread = ThreadPoolExecutor(1, "points")
+        self._thread = ThreadPoolExecutor(1, "maps")
 
     @property
     def counts(self) -> Counter[str]:
@@ -62,14 +63,14 @@ class PointMaker:
     async def _make(self, packet: bytes) -> None:
         loop = asyncio.get_running_loop()
         try:
-            points = await loop.run_in_executor(self._thread, self._path.take, packet, self._bodies)
+            maps = await loop.run_in_executor(self._thread, self._path.take, packet, self._bodies, self._wants_points())
         except WireError as error:
             self._counts["refused"] += 1
             log.warning("a residual packet is refused: %s", error)
             return
-        if points is not None:
+        if maps is not None:
             self.made += 1
-            self._show(points)
+            self._show(maps)
 
     def close(self) -> None:
         """No more work."""

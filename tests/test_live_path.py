@@ -1,0 +1,133 @@
+"""The mesh on screen follows residual maps from packet to picture: a shirt that changes is seen to, and fades."""
+
+from __future__ import annotations
+
+from collections import deque
+
+import numpy as np
+import pytest
+
+from common.body.rigged_mesh import build_rigged_mesh
+from common.body.skeleton_pose import SkeletonPose
+from common.runtime.clock import ManualClock
+from common.runtime.stage_timer import StageTimer
+from common.wire.skeleton_packet import SkeletonPacket
+from receiver.config import RepositorySettings
+from receiver.live_path import FADE_NS, PERIOD_NS, STALE_NS
+from receiver.pipeline import AnimationPath, MapPath, ReceivedPose, Shown, SkeletonToShow
+from receiver.viewer.offscreen_viewer import OffscreenViewer
+from receiver.viewer.viewer import ViewMode
+from tests.capsule_person import SHIRT, SKELETON, pose_at
+from tests.capsule_views import capsule_views
+from tests.changing_shirt import EPOCH, FRAME_NS, REVISION, ChangingShirt, reddish
+from tests.posed_cloud import BODY
+from tests.test_offscreen_viewer import FRONT
+
+SECOND_NS = 1_000_000_000
+
+
+class Receiver:
+    """Maps and skeletons in, frames out; ``sequence`` counts skeletons, one every ``FRAME_NS``."""
+
+    def __init__(self) -> None:
+        clock = ManualClock()
+        self.animation = AnimationPath(RepositorySettings(), StageTimer(clock), clock)
+        self.maps = MapPath(0, StageTimer(clock))
+        self.sequence = 0
+
+    @property
+    def now_ns(self) -> int:
+        return self.sequence * FRAME_NS
+
+    def packet(self, data: bytes) -> None:
+        new = self.maps.take(data, lambda _: {REVISION: BODY}, False)
+        assert new is not None
+        self.animation.live.note_maps(new.maps)
+
+    def skeleton(self, pose: SkeletonPose, *arrived: ReceivedPose, epoch: int = EPOCH) -> Shown:
+        self.sequence += 1
+        packet = SkeletonPacket(0, epoch, self.sequence, self.now_ns, REVISION, 1.0, pose)
+        return self.animation.show(SkeletonToShow(packet, BODY, deque(arrived)))
+
+
+@pytest.fixture
+def shirt() -> ChangingShirt:
+    return ChangingShirt()
+
+
+def shown_for(here: Receiver, shirt: ChangingShirt, duration_ns: int, send: bool = True) -> list[Shown]:
+    frames = []
+    for _ in range(round(duration_ns / FRAME_NS)):
+        pose = pose_at(here.now_ns / 1e9)
+        if send:
+            here.packet(shirt.packet(pose, here.now_ns))
+        frames.append(here.skeleton(pose))
+    return frames
+
+
+@pytest.mark.parametrize("mode", ["live", "mesh"])
+def test_a_shirt_that_turns_red_is_seen_to_although_no_new_mesh_comes(mode: ViewMode, shirt: ChangingShirt) -> None:
+    here, viewer = Receiver(), OffscreenViewer(mode=mode)
+    viewer.add_pose(shirt.mesh)
+    viewer.show(here.skeleton(pose_at(0.0), ReceivedPose(EPOCH, shirt.mesh)).frame)
+    before = viewer.render([FRONT])[0][0]
+    assert reddish(before).sum() == 0
+    shirts = (np.abs(before.astype(int) - SHIRT) < 20).all(axis=2).sum()
+    viewer.show(shown_for(here, shirt, FADE_NS + 2 * FRAME_NS)[-1].frame)
+    seen = reddish(viewer.render([FRONT])[0][0]).sum()
+    assert seen > 0.5 * shirts if mode == "live" else seen == 0
+
+
+def test_it_fades_in_stays_and_fades_out_when_maps_stop(shirt: ChangingShirt) -> None:
+    here = Receiver()
+    assert here.skeleton(pose_at(0.0), ReceivedPose(EPOCH, shirt.mesh)).frame.surface is None
+    rising = [shown.frame.live for shown in shown_for(here, shirt, FADE_NS + 3 * FRAME_NS)]
+    assert 0 < rising[0] < rising[3] < rising[6] < 1
+    assert rising[-1] == 1
+    assert max(np.diff(rising)) < 0.12
+    held = [shown.frame.live for shown in shown_for(here, shirt, STALE_NS - 3 * FRAME_NS, send=False)]
+    assert set(held) == {1.0}
+    last = shown_for(here, shirt, FADE_NS + 6 * FRAME_NS, send=False)
+    falling = [shown.frame.live for shown in last]
+    assert min(np.diff(falling)) > -0.12
+    assert falling[-1] == 0
+    assert last[-1].frame.surface is None
+
+
+def test_another_mesh_follows_at_once_and_as_much(shirt: ChangingShirt) -> None:
+    here = Receiver()
+    here.skeleton(pose_at(0.0), ReceivedPose(EPOCH, shirt.mesh))
+    shown_for(here, shirt, FADE_NS + 3 * FRAME_NS)
+    now = pose_at(here.now_ns / 1e9)
+    closer = build_rigged_mesh(8, here.now_ns, SKELETON, now, capsule_views(now))
+    frame = here.skeleton(now, ReceivedPose(EPOCH, closer)).frame
+    assert frame.pose_id == 8
+    assert frame.surface is not None
+    assert frame.surface.pose_id == 8
+    assert frame.live == 1
+
+
+def test_it_is_worked_out_a_few_times_a_second_however_many_packets_come(shirt: ChangingShirt) -> None:
+    here = Receiver()
+    here.skeleton(pose_at(0.0), ReceivedPose(EPOCH, shirt.mesh))
+    shown = shown_for(here, shirt, SECOND_NS)
+    made = {id(s.frame.surface) for s in shown}
+    assert 5 <= len(made) <= SECOND_NS / PERIOD_NS
+
+
+def test_maps_of_another_run_are_not_followed(shirt: ChangingShirt) -> None:
+    here = Receiver()
+    here.skeleton(pose_at(0.0), ReceivedPose(EPOCH, shirt.mesh))
+    shown_for(here, shirt, FADE_NS + 3 * FRAME_NS)
+    frame = here.skeleton(pose_at(1.0), ReceivedPose(EPOCH + 1, shirt.mesh), epoch=EPOCH + 1).frame
+    assert frame.pose_id == 7
+    assert (frame.surface, frame.live) == (None, 0)
+
+
+def test_without_maps_any_more_the_mesh_is_itself_again(shirt: ChangingShirt) -> None:
+    """Nobody wants them: the last one that showed them has switched."""
+    here = Receiver()
+    here.skeleton(pose_at(0.0), ReceivedPose(EPOCH, shirt.mesh))
+    shown_for(here, shirt, FADE_NS + 3 * FRAME_NS)
+    here.animation.live.note_maps(None)
+    assert shown_for(here, shirt, FADE_NS + 2 * FRAME_NS, send=False)[-1].frame.live == 0
