@@ -28,7 +28,7 @@ from common.runtime.steady_ticks import steadily
 from common.transport.access_rules import for_receiver, receiver_name
 from common.transport.link_settings import with_endpoints
 from common.transport.zenoh_session import ZenohSession, open_session, own_certificate
-from common.wire.receiver_report import WANTS_RESIDUALS
+from common.wire.receiver_report import WANTS_LIVE, WANTS_RESIDUALS
 from common.wire.skeleton_packet import SkeletonPacket
 from receiver.channels_in import Handlers, ReceiverChannels
 from receiver.config import ReceiverSettings
@@ -272,7 +272,7 @@ class _Show:
         self._counts["tick missed"] += count
 
     def _report(self) -> None:
-        wants = WANTS_RESIDUALS if self.viewer.wants_points or self.viewer.wants_live else 0
+        wants = WANTS_RESIDUALS * self.viewer.wants_points | WANTS_LIVE * self.viewer.wants_live
         self._channels.send_report(self._state.repository_poses, wants)
 
     def _tell_status(self) -> None:

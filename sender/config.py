@@ -111,9 +111,9 @@ class CandidateSettings:
 
 @dataclass(frozen=True, slots=True)
 class ResidualStreamSettings:
-    """Residual maps: what the skeleton misses, for receivers that show points. ``mode``: "auto" sends them to whoever
-    asks, at the level bandwidth allows. ``share``: of the bandwidth that candidate poses have a use for, too.
-    ``points``: of a frame at the full level."""
+    """Residual maps: what the skeleton misses, for receivers that show points or a live mesh. ``mode``: "auto" sends
+    them to whoever asks, at the level bandwidth allows. ``share``: for points, of the bandwidth that candidate poses
+    have a use for, too. ``points``: of a frame at the full level."""
 
     mode: Literal["off", "auto"] = "auto"
     share: float = 0.5

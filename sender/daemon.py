@@ -48,6 +48,7 @@ log = logging.getLogger(__name__)
 
 FIRST_SAVE_NS = 3_000_000_000  # after the first skeleton: by then the body has been seen from all sides
 SAVE_EVERY_NS = 30_000_000_000
+LIVE_INTERVAL_NS = 120_000_000  # of residual maps that only bring meshes alive: few and fine, as they age little
 LAST_WORDS_S = 0.5  # after the last frame of a recording, for what is still on its way
 
 
@@ -190,6 +191,7 @@ class _Stream:
         self._nobody = 0
         self._poses_sent = 0
         self._residual_level = 0.0
+        self._mapped_ns = 0
         self._skeleton_bytes_max = 0
         self._candidate_bytes: list[int] = []
         self.metrics = self._make_metrics()
@@ -253,8 +255,10 @@ class _Stream:
     def _map_residuals(self, tracked: TrackedFrame) -> None:
         """If anybody wants them, at the level their link allows."""
         bytes_per_s = self._links.residual_bytes_s()
-        if bytes_per_s is None:
+        seldom = not self._links.wants_points and tracked.capture_ns - self._mapped_ns < LIVE_INTERVAL_NS
+        if bytes_per_s is None or seldom:
             return
+        self._mapped_ns = tracked.capture_ns
         self._residuals.note_budget(bytes_per_s)
         if self._links.lacks_residual_key:
             self._residuals.request_key()

@@ -2,7 +2,8 @@
 
 The live sender asks with what its window allows, the encoder of a session with the rate it was given.
 
-The rule: of the bytes both have a use for, residual maps get ``share``; what one has no use for is the other's. It is
+The rule: of the bytes both have a use for, residual maps get ``share``, or ``LIVE_SHARE`` where they only bring a mesh
+alive, and then none on a link of under ``LIVE_LEAST_BYTES_S``; what one has no use for is the other's. It is
 kept as a debt in bytes, half a second's at most, so that neither makes up for a long silence at the other's expense.
 Maps go between a pose's chunks, since a pose is worth the same a second later and a map is not: of maps only the newest
 waits, and it drives out what is left of the one before. A difference whose key has not gone out is worth nothing and
@@ -20,6 +21,9 @@ from dataclasses import dataclass
 from sender.candidate_poses.mesh_scheduler import MeshScheduler, SendRecord
 from sender.residual_path import Residual
 
+LIVE_SHARE = 0.1  # more of it costs the poses more than it gives (docs/compression.md)
+LIVE_LEAST_BYTES_S = 50_000.0  # 0.4 Mbit/s
+LIVE_BEGIN = 1.25  # × that, for those who have none
 DEBT_S = 0.5  # of the budget
 RECENT_NS = 2_000_000_000  # what poses took lately counts this long
 
@@ -47,22 +51,31 @@ class Outgoing:
 
 class OutgoingBulk:
     """``on_sent`` is told of every candidate pose that goes out: whoever asks sees it through. ``wants_residuals``: the
-    receiver has a use for them. ``counts``: residual packets and bytes sent, packets dropped."""
+    receiver has a use for them; ``for_points``: for every frame's. ``counts``: residual packets and bytes sent, packets
+    dropped."""
 
     def __init__(
         self, receiver: str, scheduler: MeshScheduler, on_sent: Callable[[SendRecord], None], share: float = 0.5
     ) -> None:
         self.counts: Counter[str] = Counter()
         self.wants_residuals = False
+        self.for_points = True
         self._receiver = receiver
         self._scheduler = scheduler
         self._on_sent = on_sent
-        self._share = share
+        self._share = self._share_of_points = share
         self._owed = 0.0  # bytes that residuals are behind their share
         self._pending: Residual | None = None
         self._key_sent: int | None = None  # the sequence of the last key that went out
         self._last_difference: Hashable | None = None
         self._pose_bytes_s, self._pose_ns = 0.0, 0
+
+    def want(self, points: bool, live: bool, bytes_s: float) -> None:
+        """What the receiver has a use for, and what its link may carry."""
+        begin = 1.0 if self.wants_residuals else LIVE_BEGIN
+        self.for_points = points
+        self.wants_residuals = points or (live and bytes_s >= begin * LIVE_LEAST_BYTES_S)
+        self._share = self._share_of_points if points else LIVE_SHARE
 
     @property
     def needs_key(self) -> bool:

@@ -16,7 +16,7 @@ from common.transport.channel_publisher import ChannelPublisher
 from common.transport.channel_query import Question
 from common.transport.channel_subscriber import Arrival
 from common.transport.channels import receiver_of
-from common.wire.receiver_report import WANTS_RESIDUALS, decode_report
+from common.wire.receiver_report import WANTS_LIVE, WANTS_RESIDUALS, decode_report
 from common.wire.repository_list import RepositoryList, decode_repository_list, encode_repository_list
 from sender.candidate_poses.mesh_scheduler import MeshScheduler, SendRecord
 from sender.outgoing_bulk import Outgoing, OutgoingBulk, pose_name, poses_in
@@ -123,11 +123,18 @@ class ReceiverLinks:
             link.bulk.wake()
 
     def residual_bytes_s(self) -> float | None:
-        """What residual packets may take, on the thinnest link to a receiver that wants them; None: nobody does."""
+        """What residual packets may take, on the thinnest link to a receiver that wants them (as points if any do: the
+        others leave some out); None: nobody does."""
         now_ns = self._clock.now_ns()
         wanting = [link for link in self.links if link.choice.wants_residuals]
+        wanting = [link for link in wanting if link.choice.for_points] or wanting
         allowed = (link.choice.residual_bytes_s(link.bulk.window.allowed_bytes_s, now_ns) for link in wanting)
         return min(allowed, default=None)
+
+    @property
+    def wants_points(self) -> bool:
+        """Somebody has a use for the residual packet of every frame."""
+        return any(link.choice.wants_residuals and link.choice.for_points for link in self.links)
 
     @property
     def lacks_residual_key(self) -> bool:
@@ -162,7 +169,8 @@ class ReceiverLinks:
             self.counts["back"] += 1
             log.info("receiver %s is back", link.name)
         link.heard_ns = arrival.arrival_ns
-        link.choice.wants_residuals = bool(report.wants & WANTS_RESIDUALS)
+        points, live = bool(report.wants & WANTS_RESIDUALS), bool(report.wants & WANTS_LIVE)
+        link.choice.want(points, live, link.bulk.window.allowed_bytes_s)
         link.skeleton_divisor = report.skeleton_divisor
         link.bulk.window.trickle = report.skeleton_divisor > 1  # its path does not even carry the skeletons
         link.bulk.on_report(report)

@@ -6,7 +6,7 @@ import pytest
 
 from sender.candidate_poses.mesh_scheduler import MeshScheduler, SendRecord
 from sender.candidate_poses.usable_pose_set import Quotients
-from sender.outgoing_bulk import Outgoing, OutgoingBulk
+from sender.outgoing_bulk import LIVE_LEAST_BYTES_S, LIVE_SHARE, Outgoing, OutgoingBulk
 from sender.residual_path import Residual
 
 MS, SECOND_NS = 1_000_000, 1_000_000_000
@@ -160,3 +160,17 @@ def test_a_receiver_that_wants_none_costs_poses_nothing():
     bench.run(2.0, None, poses=True)
     assert bench.sent_bytes["residual"] == 0
     assert bench.sent_bytes["pose"] > 0.9 * 2 * RATE
+
+
+def test_a_live_surface_takes_a_tenth_and_nothing_of_a_thin_link():
+    bench = Bench(0.5)
+    bench.choice.want(points=False, live=True, bytes_s=RATE)
+    bench.run(6.0, None, poses=True)
+    both = sum(bench.sent_bytes.values())
+    assert bench.sent_bytes["residual"] / both == pytest.approx(LIVE_SHARE, abs=0.04)
+    for bytes_s, wanted in ((1.1, True), (0.9, False), (1.1, False), (1.3, True)):  # × the least: no to and fro
+        bench.choice.want(points=False, live=True, bytes_s=bytes_s * LIVE_LEAST_BYTES_S)
+        assert bench.choice.wants_residuals == wanted
+    bench.choice.want(points=True, live=True, bytes_s=0.1 * LIVE_LEAST_BYTES_S)
+    assert bench.choice.wants_residuals
+    assert bench.choice.residual_bytes_s(RATE, 0) >= 0.5 * RATE
