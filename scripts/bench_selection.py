@@ -16,7 +16,6 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from common.body.body_regions import default_region_weights
@@ -25,6 +24,7 @@ from common.body.joint_edge_store import JointEdgeStore
 from common.body.rigged_mesh import RiggedMesh
 from common.body.skeleton_pose import forward_kinematics
 from common.body.skinning import Skinning, animate, link_motion
+from common.body.surface_normals import vertex_normals
 from common.geometry.rasterizer import render
 from receiver.pipeline import mesh_of
 from receiver.repository.pose_repository import PoseRepository, RepositorySettings
@@ -113,7 +113,7 @@ def _costs(case: str, material: _Material) -> Iterator[Row]:
     for skinning in _SKINNINGS:
 
         def animated(skinning: Skinning = skinning) -> None:
-            _vertex_normals(animate(mesh, motion, skinning), mesh.faces_drawn)
+            vertex_normals(animate(mesh, motion, skinning), mesh.faces_drawn)
 
         figure = _fastest_ms(animated) * per_vertex
         yield _row(case, f"animate_ms_50k/{skinning}", figure, "ms", 5.0, f"with normals, scaled from {size}")
@@ -196,28 +196,6 @@ def _draw_scores(file: Path, material: _Material, recorded: Capture) -> None:
         cv2.putText(picture, text, (8, 28), cv2.FONT_HERSHEY_SIMPLEX, 0.8, (0, 0, 0), 2, cv2.LINE_AA)
         pictures.append(picture)
     cv2.imwrite(str(file), cv2.cvtColor(np.concatenate(pictures, axis=1), cv2.COLOR_RGB2BGR))
-
-
-@njit(nogil=True, cache=True, error_model="numpy")
-def _vertex_normals(vertices, faces):  # type: ignore[no-untyped-def]
-    """Unit normals (V, 3), as a lit renderer would need them: the sum of the triangles' around each vertex."""
-    out = np.zeros_like(vertices)
-    for f in range(len(faces)):
-        a, b, c = vertices[faces[f, 0]], vertices[faces[f, 1]], vertices[faces[f, 2]]
-        ux, uy, uz = b[0] - a[0], b[1] - a[1], b[2] - a[2]
-        vx, vy, vz = c[0] - a[0], c[1] - a[1], c[2] - a[2]
-        x, y, z = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
-        for k in range(3):
-            n = out[faces[f, k]]
-            n[0] += x
-            n[1] += y
-            n[2] += z
-    for v in range(len(out)):
-        n = out[v]
-        length = np.sqrt(n[0] * n[0] + n[1] * n[1] + n[2] * n[2])
-        if length > 0:
-            n /= length
-    return out
 
 
 def _fastest_ms(action: Callable[[], object], runs: int = RUNS) -> float:

@@ -61,55 +61,59 @@ def move(
 def _move(vertices, vertex_link, motion):  # type: ignore[no-untyped-def]
     out = np.empty_like(vertices)
     for v in range(len(vertices)):
-        _apply(motion[vertex_link[v]], vertices[v], out[v])
+        x, y, z = vertices[v, 0], vertices[v, 1], vertices[v, 2]
+        out[v, 0], out[v, 1], out[v, 2] = _moved(motion, vertex_link[v], x, y, z)
     return out
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
 def _linear(vertices, vertex_link, other, share, motion):  # type: ignore[no-untyped-def]
-    out, second = np.empty_like(vertices), np.empty(3, np.float32)
+    out = np.empty_like(vertices)
     for v in range(len(vertices)):
-        _apply(motion[vertex_link[v]], vertices[v], out[v])
+        x, y, z = vertices[v, 0], vertices[v, 1], vertices[v, 2]
+        px, py, pz = _moved(motion, vertex_link[v], x, y, z)
         if share[v]:
-            _apply(motion[other[v]], vertices[v], second)
-            b = np.float32(share[v] / 255.0)
-            for i in range(3):
-                out[v, i] += b * (second[i] - out[v, i])
+            qx, qy, qz = _moved(motion, other[v], x, y, z)
+            b = np.float32(share[v]) / np.float32(255.0)
+            px, py, pz = px + b * (qx - px), py + b * (qy - py), pz + b * (qz - pz)
+        out[v, 0], out[v, 1], out[v, 2] = px, py, pz
     return out
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
 def _spherical(vertices, vertex_link, other, share, joint, motion, turns, joints):  # type: ignore[no-untyped-def]
     """QLERP of both links' quaternions (w, x, y, z) about the joint, whose own place is mixed linearly."""
-    out, second = np.empty_like(vertices), np.empty(3, np.float32)
-    arm, centre = np.empty(3, np.float32), np.empty(3, np.float32)
+    out = np.empty_like(vertices)
     for v in range(len(vertices)):
+        m, n, j = vertex_link[v], other[v], joint[v]
         if share[v] == 0:
-            _apply(motion[vertex_link[v]], vertices[v], out[v])
+            x, y, z = vertices[v, 0], vertices[v, 1], vertices[v, 2]
+            out[v, 0], out[v, 1], out[v, 2] = _moved(motion, m, x, y, z)
             continue
-        p, q, b = turns[vertex_link[v]], turns[other[v]], np.float32(share[v] / 255.0)
-        c = b if p[0] * q[0] + p[1] * q[1] + p[2] * q[2] + p[3] * q[3] >= 0 else -b
-        w, x = (1 - b) * p[0] + c * q[0], (1 - b) * p[1] + c * q[1]
-        y, z = (1 - b) * p[2] + c * q[2], (1 - b) * p[3] + c * q[3]
-        s = 2 / (w * w + x * x + y * y + z * z)
-        _apply(motion[vertex_link[v]], joints[joint[v]], centre)
-        _apply(motion[other[v]], joints[joint[v]], second)
-        for i in range(3):
-            arm[i] = vertices[v, i] - joints[joint[v], i]
-            centre[i] += b * (second[i] - centre[i])
+        b = np.float32(share[v]) / np.float32(255.0)
+        alike = turns[m, 0] * turns[n, 0] + turns[m, 1] * turns[n, 1]
+        alike += turns[m, 2] * turns[n, 2] + turns[m, 3] * turns[n, 3]
+        a, c = np.float32(1.0) - b, b if alike >= 0 else -b
+        w, x = a * turns[m, 0] + c * turns[n, 0], a * turns[m, 1] + c * turns[n, 1]
+        y, z = a * turns[m, 2] + c * turns[n, 2], a * turns[m, 3] + c * turns[n, 3]
+        s = np.float32(2.0) / (w * w + x * x + y * y + z * z)
+        jx, jy, jz = joints[j, 0], joints[j, 1], joints[j, 2]
+        ax, ay, az = vertices[v, 0] - jx, vertices[v, 1] - jy, vertices[v, 2] - jz
+        px, py, pz = _moved(motion, m, jx, jy, jz)
+        qx, qy, qz = _moved(motion, n, jx, jy, jz)
         # v + 2/|q|² · u × (u × v + w v), u = (x, y, z)
-        tx = y * arm[2] - z * arm[1] + w * arm[0]
-        ty = z * arm[0] - x * arm[2] + w * arm[1]
-        tz = x * arm[1] - y * arm[0] + w * arm[2]
-        out[v, 0] = centre[0] + arm[0] + s * (y * tz - z * ty)
-        out[v, 1] = centre[1] + arm[1] + s * (z * tx - x * tz)
-        out[v, 2] = centre[2] + arm[2] + s * (x * ty - y * tx)
+        tx, ty, tz = y * az - z * ay + w * ax, z * ax - x * az + w * ay, x * ay - y * ax + w * az
+        out[v, 0] = px + b * (qx - px) + ax + s * (y * tz - z * ty)
+        out[v, 1] = py + b * (qy - py) + ay + s * (z * tx - x * tz)
+        out[v, 2] = pz + b * (qz - pz) + az + s * (x * ty - y * tx)
     return out
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
-def _apply(m, point, out):  # type: ignore[no-untyped-def]
-    x, y, z = point[0], point[1], point[2]
-    out[0] = m[0, 0] * x + m[0, 1] * y + m[0, 2] * z + m[0, 3]
-    out[1] = m[1, 0] * x + m[1, 1] * y + m[1, 2] * z + m[1, 3]
-    out[2] = m[2, 0] * x + m[2, 1] * y + m[2, 2] * z + m[2, 3]
+def _moved(motion, link, x, y, z):  # type: ignore[no-untyped-def]
+    """A point moved with its link."""
+    return (
+        motion[link, 0, 0] * x + motion[link, 0, 1] * y + motion[link, 0, 2] * z + motion[link, 0, 3],
+        motion[link, 1, 0] * x + motion[link, 1, 1] * y + motion[link, 1, 2] * z + motion[link, 1, 3],
+        motion[link, 2, 0] * x + motion[link, 2, 1] * y + motion[link, 2, 2] * z + motion[link, 2, 3],
+    )

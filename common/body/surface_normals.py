@@ -7,6 +7,15 @@ from numba import njit
 from numpy.typing import NDArray
 
 
+def vertex_normals(vertices: NDArray[np.float32], faces: NDArray[np.int32]) -> NDArray[np.float32]:
+    """Unit normals (V, 3) float32 of vertices (V, 3): the sum of those of the triangles (F, 3) around each, larger ones
+    counting for more; 0 without any."""
+    normals = np.zeros_like(vertices)
+    _add_face_normals(vertices, faces, normals)
+    _unit(normals)
+    return normals
+
+
 def normals_and_incidence(
     vertices: NDArray[np.float32],
     faces: NDArray[np.int32],
@@ -78,5 +87,5 @@ def _unit(normals):  # type: ignore[no-untyped-def]
     for v in range(len(normals)):
         x, y, z = normals[v, 0], normals[v, 1], normals[v, 2]
         squared = x * x + y * y + z * z
-        scale = 1 / np.sqrt(squared) if squared > 0 else np.float32(0.0)
+        scale = np.float32(1.0) / np.sqrt(squared) if squared > 0 else np.float32(0.0)
         normals[v, 0], normals[v, 1], normals[v, 2] = x * scale, y * scale, z * scale
