@@ -1,4 +1,5 @@
-"""What choosing costs: σ per pose, both searches over repository size, animation, and keeping χ and coverage.
+"""What choosing costs: σ per pose, both searches over repository size, animation, keeping χ and coverage, and all of it
+live: 30 skeletons a second before 200 poses.
 
 Poses are captured from the built-in performer's routine by four virtual cameras; repositories larger than what was
 captured hold it several times, each copy in memory of its own. Times are the fastest of many, to be told apart from
@@ -26,6 +27,7 @@ from common.body.skeleton_pose import forward_kinematics
 from common.body.skinning import Skinning, animate, link_motion
 from common.body.surface_normals import vertex_normals
 from common.geometry.rasterizer import render
+from common.runtime.clock import Clock, MonotonicClock
 from receiver.pipeline import mesh_of
 from receiver.repository.pose_repository import PoseRepository, RepositorySettings
 from receiver.repository.pose_selection import PoseSelector, SelectionSettings
@@ -34,6 +36,7 @@ from scripts.fidelity_capture import Capture, capture, show_progress
 from scripts.fidelity_methods import encoded_candidate
 from scripts.line_chart import line_chart
 from scripts.run_bench import Row
+from scripts.selection_live import ThreadClock, played_live
 from sender.candidate_poses.pose_coverage import CoverageSet
 
 CAPTURED_S = 14.0
@@ -41,6 +44,7 @@ POSE_EVERY = 8  # frames
 SIZES = (1, 5, 10, 19, 50, 100, 200, 500, 1000)  # of a repository; 19 is where the paper's exhaustive search ends
 GOAL_VERTICES = 46_000  # of the goal for σ; its joint edges grow as the root of the vertices
 RUNS, FRAMES = 40, 20
+LIVE_POSES, LIVE_S = 200, 20.0
 _SKINNINGS: tuple[Skinning, ...] = ("rigid", "linear", "spherical")
 
 
@@ -74,6 +78,7 @@ def run(
     gaps = _gaps(material)
     yield _row(case, "exhaustive_vs_threshold_gap_max", float(gaps.max()), "1", 0.12, "DISPOSE §7.1.1")
     yield _row(case, "exhaustive_vs_threshold_gap_mean", float(gaps.mean()), "1")
+    yield from _live(case, recorded, material)
     if pictures is not None:
         pictures.mkdir(parents=True, exist_ok=True)
         _draw_searches(pictures / "search-time.svg", exhaustive, threshold)
@@ -117,6 +122,23 @@ def _costs(case: str, material: _Material) -> Iterator[Row]:
 
         figure = _fastest_ms(animated) * per_vertex
         yield _row(case, f"animate_ms_50k/{skinning}", figure, "ms", 5.0, f"with normals, scaled from {size}")
+
+
+def _live(case: str, recorded: Capture, material: _Material) -> Iterator[Row]:
+    """By the clock on the wall, and by the threads' own time on a core."""
+    frames = [recorded.frame(k) for k in range(recorded.length)]
+    coming = enumerate(range(0, recorded.length, 7 * POSE_EVERY), start=LIVE_POSES)
+    encoded = [encoded_candidate(pose_id, k, frames[k], own=False) for pose_id, k in coming]
+    messages = [message for message in encoded if message is not None]
+    clocks: dict[str, Clock] = {"live": MonotonicClock(), "live-core": ThreadClock()}
+    for name, clock in clocks.items():
+        live = played_live(material.meshes, [frame.true for frame in frames], messages, LIVE_POSES, LIVE_S, clock)
+        size = f"30 skeletons a second for {LIVE_S:.0f} s, {live.poses} poses, one more a second"
+        yield _row(case, f"{name}/shown_hz", live.shown_hz, "1/s", None, size)
+        for stage in ("selection", "animate", "mesh"):
+            found = live.stages[stage]
+            yield _row(case, f"{name}/{stage}_ms_p50", found.p50_ms, "ms", None, f"{found.count} runs")
+            yield _row(case, f"{name}/{stage}_ms_p99", found.p99_ms, "ms")
 
 
 def _skeleton_update_ms(material: _Material) -> float:

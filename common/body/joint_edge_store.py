@@ -17,7 +17,8 @@ FIRST_EDGES, FIRST_PAIRS = 1 << 14, 1 << 8
 
 
 class JointEdgeStore:
-    """Poses by id. Each is a run of edges and a run of link pairs; what leaves is closed up when it is half of all."""
+    """Poses by id. Each is a run of edges and a run of link pairs, those first that weigh most in σ; what leaves is
+    closed up when it is half of all."""
 
     def __init__(self, region_weights: NDArray[np.float32]) -> None:
         self._weights = region_weights
@@ -48,13 +49,15 @@ class JointEdgeStore:
         run = slice(self._edges, self._edges + len(edges))
         pairs = slice(self._pairs, self._pairs + len(edges.pair_links))
         self._points[:, run], self._rest[run] = edges.points, edges.rest_lengths
-        self._links[pairs] = edges.pair_links
-        self._pair_edges[pairs, 0] = run.start + edges.pair_starts[:-1]
-        self._pair_edges[pairs, 1] = run.start + edges.pair_starts[1:]
         regions = max(int(np.count_nonzero(edges.region_lengths)), 1)
         with np.errstate(divide="ignore"):
             per_metre = np.where(edges.region_lengths > 0, self._weights / edges.region_lengths / regions, 0)
-        self._pair_weights[pairs] = per_metre[edges.pair_regions].sum(axis=1)
+        weights = per_metre[edges.pair_regions].sum(axis=1)
+        pair_of = np.repeat(np.arange(len(weights)), np.diff(edges.pair_starts))
+        order = np.argsort(-weights * np.bincount(pair_of, edges.rest_lengths, len(weights)))
+        self._links[pairs], self._pair_weights[pairs] = edges.pair_links[order], weights[order]
+        self._pair_edges[pairs, 0] = run.start + edges.pair_starts[:-1][order]
+        self._pair_edges[pairs, 1] = run.start + edges.pair_starts[1:][order]
         self._runs[pose_id] = run, pairs
         self._edges, self._pairs = run.stop, pairs.stop
         self._edges_held += len(edges)
@@ -71,15 +74,21 @@ class JointEdgeStore:
         self._runs.clear()
         self._edges = self._pairs = self._edges_held = 0
 
-    def scores(self, pose_ids: list[int], T_world_link: NDArray[np.float32], limit: float = 0.0) -> NDArray[np.float32]:
+    def scores(
+        self, pose_ids: list[int], T_world_link: NDArray[np.float32], limit: float = 0.0, best_only: bool = False
+    ) -> NDArray[np.float32]:
         """σ (n,) float32 of the poses for links (L, 4, 4), in the order given, up to and with the first one below
-        ``limit``: the others are not scored. A pose without edges cannot be judged: its σ is infinite."""
+        ``limit``: the others are not scored. A pose without edges cannot be judged: its σ is infinite.
+
+        ``best_only``: the lowest σ is right; of others it may be what was added up when it passed the lowest so far,
+        for a sum of lengths only grows.
+        """
         runs = [self._runs[pose_id][1] for pose_id in pose_ids]
         pairs = np.array([(run.start, run.stop) for run in runs], np.int64).reshape(-1, 2)
         found = np.empty(len(pairs), np.float32)
         count = _search(
             self._points, self._rest, self._links, self._pair_edges, self._pair_weights, pairs,
-            np.ascontiguousarray(T_world_link, np.float32), np.float32(limit), found,
+            np.ascontiguousarray(T_world_link, np.float32), np.float32(limit), best_only, found,
         )  # fmt: skip
         return found[:count]
 
@@ -107,11 +116,12 @@ class JointEdgeStore:
 
 
 @njit(nogil=True, cache=True, error_model="numpy", fastmath={"reassoc", "contract", "nsz"})
-def _search(points, rest, links, pair_edges, pair_weights, pose_pairs, T, limit, out):  # type: ignore[no-untyped-def]
+def _search(points, rest, links, pair_edges, pair_weights, pose_pairs, T, limit, best_only, out):  # type: ignore[no-untyped-def]
     """Writes σ of each pose to ``out``; returns how many it scored."""
     R = np.empty((LINK_COUNT, LINK_COUNT, 3, 3), np.float32)
     t = np.empty((LINK_COUNT, LINK_COUNT, 3), np.float32)
     known = np.zeros((LINK_COUNT, LINK_COUNT), np.bool_)
+    lowest = np.float32(np.inf)
     for n in range(len(pose_pairs)):
         sigma = np.float32(0.0)
         for p in range(pose_pairs[n, 0], pose_pairs[n, 1]):
@@ -121,7 +131,10 @@ def _search(points, rest, links, pair_edges, pair_weights, pose_pairs, T, limit,
                 seen_from(T, a, b, R[a, b], t[a, b])
             change = length_change(points, rest, pair_edges[p, 0], pair_edges[p, 1], R[a, b], t[a, b])
             sigma += change * pair_weights[p]
+            if best_only and sigma > lowest:
+                break
         out[n] = sigma if pose_pairs[n, 1] > pose_pairs[n, 0] else np.float32(np.inf)
+        lowest = min(lowest, out[n])
         if out[n] < limit:
             return n + 1
     return len(pose_pairs)

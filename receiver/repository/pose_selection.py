@@ -17,7 +17,7 @@ class Poses(Protocol):
     def __contains__(self, pose_id: int) -> bool: ...
     def by_use(self) -> list[int]: ...
     def scores(
-        self, pose_ids: list[int], T_world_link: NDArray[np.float32], limit: float = 0.0
+        self, pose_ids: list[int], T_world_link: NDArray[np.float32], limit: float = 0.0, best_only: bool = False
     ) -> NDArray[np.float32]: ...
 
 
@@ -90,7 +90,7 @@ class PoseSelector:
             sigma = float(poses.scores(ids[:1], T_world_link)[0])
             if sigma < limit:
                 return on_screen, sigma, 1, True
-        sigmas = poses.scores(ids, T_world_link, limit if settings.search == "threshold" else 0.0)
+        sigmas = poses.scores(ids, T_world_link, limit if settings.search == "threshold" else 0.0, best_only=True)
         best = int(np.argmin(sigmas))
         kept = on_screen is not None and sigmas[0] * (1 - settings.hysteresis) <= sigmas[best]
         chosen = 0 if kept else best
