@@ -2,22 +2,26 @@
 
 from __future__ import annotations
 
+import contextlib
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 from common.runtime.clock import MonotonicClock
 from common.runtime.progress import ProgressLine
 from common.runtime.session_recording import RecordingError, SessionReader
-from common.transport.channels import SCHEMA
+from common.transport.channels import SCHEMA, SKELETON
+from common.wire.header import WireError
+from common.wire.skeleton_packet import decode_skeleton
 from receiver.config import ReceiverSettings
 from receiver.decoded_files import Output, PersonFolder, PictureFolder, PointFolder, VideoFile
-from receiver.session_player import SessionPlayer, display_ticks
+from receiver.session_player import SessionPlayer, channel_of, display_ticks
 from receiver.viewer.person_files import ExportError
 
 DAMAGED, INTERRUPTED = 3, 130
-DEFAULT_RATE_HZ = 30.0
+DEFAULT_RATE_HZ, RATE_MAX_HZ = 30.0, 240.0
+RATE_SKELETONS = 100  # so many tell at which rate they come
 PERSONS_MAX = 255
 
 
@@ -48,7 +52,7 @@ def decode(settings: ReceiverSettings, options: DecodeOptions, say: Callable[[st
     """
     try:
         reader = SessionReader(options.session, SCHEMA)
-        rate_hz = options.rate_hz or frame_rate_hz(reader)
+        rate_hz = options.rate_hz or frame_rate_hz(reader.about) or captured_rate_hz(options.session, person_of(reader))
         player = SessionPlayer(settings.repository, person_of(reader), (settings.view.mode,))
         output = _output(settings, options, rate_hz)
         try:
@@ -107,13 +111,35 @@ def person_of(reader: SessionReader) -> int:
     return int(text)
 
 
-def frame_rate_hz(reader: SessionReader) -> float:
-    """The recording's, or 30 where the session does not say."""
+def frame_rate_hz(about: Mapping[str, str]) -> float | None:
+    """The recording's, None where the session does not say."""
     try:
-        rate_hz = float(reader.about.get("frame_rate_hz", ""))
+        rate_hz = float(about.get("frame_rate_hz", ""))
     except ValueError:
-        return DEFAULT_RATE_HZ
-    return rate_hz if 1 <= rate_hz <= 240 else DEFAULT_RATE_HZ
+        return None
+    return rate_hz if 1 <= rate_hz <= RATE_MAX_HZ else None
+
+
+def captured_rate_hz(session: Path, person: int) -> float:
+    """At which a session's first skeletons were captured: a receiver that records does not know it when it begins.
+    30 where there are too few.
+
+    Raises:
+        RecordingError: it cannot be read.
+    """
+    captured: dict[int, int] = {}  # by number; some may be lost
+    for message in SessionReader(session, SCHEMA).messages():
+        if channel_of(message.key, person) != SKELETON.name:
+            continue
+        with contextlib.suppress(WireError):
+            packet = decode_skeleton(message.payload)
+            captured[packet.sequence] = packet.capture_ns
+        if len(captured) >= RATE_SKELETONS:
+            break
+    first, last = min(captured, default=0), max(captured, default=0)
+    passed_ns = captured[last] - captured[first] if captured else 0
+    rate_hz = (last - first) * 1e9 / passed_ns if passed_ns > 0 else DEFAULT_RATE_HZ
+    return rate_hz if 1 <= rate_hz <= RATE_MAX_HZ else DEFAULT_RATE_HZ
 
 
 def check_played(reader: SessionReader, player: SessionPlayer) -> None:

@@ -46,7 +46,7 @@ class SessionPlayer:
     def take(self, message: StoredMessage) -> Shown | LinkPoints | None:
         """Take in the next message; what a skeleton or a residual packet leads to. What is malformed is counted and
         changes nothing."""
-        channel = _channel_of(message.key, self._person)
+        channel = channel_of(message.key, self._person)
         self.payload_bytes[channel] += len(message.payload)
         try:
             if channel == channels.SKELETON.name:
@@ -89,7 +89,7 @@ class SessionPlayer:
         return None if new is None else new.points
 
 
-def _channel_of(key: str, person: int) -> str:
+def channel_of(key: str, person: int) -> str:
     """The channel's name in a key of this person's, whatever the site; "" in others."""
     parts = key.split("/")
     return parts[3] if len(parts) >= 4 and parts[2] == str(person) else ""

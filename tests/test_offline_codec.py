@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import asyncio
+import signal
+from collections.abc import Callable, Iterator
 from contextlib import aclosing
+from dataclasses import replace
 from pathlib import Path
+from typing import TypeVar
 
 import cv2
 import numpy as np
@@ -18,20 +22,25 @@ from common.transport.channels import CHANNELS
 from common.transport.chunks import ChunkAssembler, decode_chunk
 from common.transport.temporal_layers import LAYERS, layer_of
 from common.wire.residual_packet import is_residual
-from common.wire.skeleton_packet import decode_skeleton
+from common.wire.skeleton_packet import decode_skeleton, encode_skeleton
 from receiver.cli import run_decode
 from receiver.config import ReceiverSettings, ViewSettings
-from receiver.decode import DAMAGED, DecodeError, DecodeOptions, decode
+from receiver.decode import DAMAGED, DecodeError, DecodeOptions, captured_rate_hz, decode
 from receiver.decoded_files import camera_before
+from receiver.session_log import SessionLog
 from receiver.session_page import SessionPage
+from receiver.session_player import display_ticks
 from receiver.viewer.page_client import follow
 from scripts.daemon_processes import free_port
 from scripts.fidelity import compare
 from sender.cli import run_encode
 from sender.config import CandidateSettings, ResidualStreamSettings, SenderSettings
-from sender.encode import EncodeError
+from sender.encode import EncodeError, EncodeOptions, encode
+from sender.session_encoder import frame_sets
 from tests.rig_scene import RATE_HZ, performer
 from tests.stored_session import FRAMES, encoded, write_frames
+
+T = TypeVar("T")
 
 
 @pytest.fixture(scope="module")
@@ -109,6 +118,48 @@ def test_a_decoded_video_shows_the_person(session, tmp_path):
     assert f"{FRAMES} pictures" in said[0]
     assert video.get(cv2.CAP_PROP_FPS) == RATE_HZ
     assert psnr_db(np.ascontiguousarray(pictures[-1]), FRAMES) > 24  # the video's own losses included
+
+
+def test_a_live_recording_is_decoded_at_the_rate_it_was_captured_at(session, tmp_path):
+    log = SessionLog(tmp_path / "live.mcap", "studio", 0)  # which the receiver does not know when it begins
+    for message in SessionReader(session, "v1").messages():
+        payload = message.payload
+        if "/skeleton/" in message.key:  # half as fast
+            packet = decode_skeleton(payload)
+            payload = encode_skeleton(replace(packet, capture_ns=2 * packet.capture_ns))
+        log.add(message.key, 2 * message.time_ns, payload)
+    log.close()
+    assert captured_rate_hz(tmp_path / "live.mcap", 0) == pytest.approx(RATE_HZ / 2, rel=0.01)
+    assert decoded(tmp_path / "live.mcap", tmp_path / "out.mp4")[0] == 0
+    video = cv2.VideoCapture(str(tmp_path / "out.mp4"))
+    assert video.get(cv2.CAP_PROP_FPS) == pytest.approx(RATE_HZ / 2, rel=0.01)
+    assert video.get(cv2.CAP_PROP_FRAME_COUNT) == pytest.approx(FRAMES, abs=2)
+
+
+def interrupted(work: Callable[..., Iterator[T]], after: int) -> Callable[..., Iterator[T]]:
+    """``work`` in the midst of which somebody presses Ctrl-C."""
+
+    def stopped(*arguments: object) -> Iterator[T]:
+        for number, made in enumerate(work(*arguments)):
+            if number == after:
+                signal.raise_signal(signal.SIGINT)
+            yield made
+
+    return stopped
+
+
+def test_ctrl_c_keeps_what_was_encoded_and_decoded_by_then(recording, session, tmp_path, monkeypatch):
+    monkeypatch.setattr("sender.encode.frame_sets", interrupted(frame_sets, 12))
+    monkeypatch.setattr("receiver.decode.display_ticks", interrupted(display_ticks, 7))
+    said: list[str] = []
+    assert encode(SenderSettings(), EncodeOptions(recording, tmp_path / "s.mcap", 4.0), said.append) == 130
+    assert said[0] == "stopped; what was encoded by then is kept"
+    assert len([m for m in SessionReader(tmp_path / "s.mcap", "v1").messages() if "/skeleton/" in m.key]) >= 5
+    code, said = decoded(session, tmp_path / "out.mp4")
+    assert code == 130
+    assert said[0] == "stopped; what was decoded by then is kept"
+    assert cv2.VideoCapture(str(tmp_path / "out.mp4")).get(cv2.CAP_PROP_FRAME_COUNT) == 7
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["out.mp4", "s.mcap"]
 
 
 def test_decoded_pictures_show_the_person_in_the_posture_of_their_frame(session, tmp_path):
