@@ -28,7 +28,7 @@ from common.runtime.steady_ticks import steadily
 from common.transport.access_rules import for_receiver, receiver_name
 from common.transport.link_settings import with_endpoints
 from common.transport.zenoh_session import ZenohSession, open_session, own_certificate
-from common.wire.receiver_report import WANTS_LIVE, WANTS_RESIDUALS
+from common.wire.receiver_report import SPARES_POSES, WANTS_LIVE, WANTS_RESIDUALS
 from common.wire.skeleton_packet import SkeletonPacket
 from receiver.channels_in import Handlers, ReceiverChannels
 from receiver.config import ReceiverSettings
@@ -273,6 +273,8 @@ class _Show:
 
     def _report(self) -> None:
         wants = WANTS_RESIDUALS * self.viewer.wants_points | WANTS_LIVE * self.viewer.wants_live
+        if self._state.repository_poses > 0 and not self.viewer.wants_poses:  # with one, whoever looks sees somebody
+            wants |= SPARES_POSES
         self._channels.send_report(self._state.repository_poses, wants)
 
     def _tell_status(self) -> None:

@@ -51,15 +51,15 @@ class Outgoing:
 
 class OutgoingBulk:
     """``on_sent`` is told of every candidate pose that goes out: whoever asks sees it through. ``wants_residuals``: the
-    receiver has a use for them; ``for_points``: for every frame's. ``counts``: residual packets and bytes sent, packets
-    dropped."""
+    receiver has a use for them; ``for_points``: for every frame's; ``wants_poses``: for more candidate poses.
+    ``counts``: residual packets and bytes sent, packets dropped."""
 
     def __init__(
         self, receiver: str, scheduler: MeshScheduler, on_sent: Callable[[SendRecord], None], share: float = 0.5
     ) -> None:
         self.counts: Counter[str] = Counter()
         self.wants_residuals = False
-        self.for_points = True
+        self.for_points = self.wants_poses = True
         self._receiver = receiver
         self._scheduler = scheduler
         self._on_sent = on_sent
@@ -70,8 +70,9 @@ class OutgoingBulk:
         self._last_difference: Hashable | None = None
         self._pose_bytes_s, self._pose_ns = 0.0, 0
 
-    def want(self, points: bool, live: bool, bytes_s: float) -> None:
+    def want(self, points: bool, live: bool, poses: bool, bytes_s: float) -> None:
         """What the receiver has a use for, and what its link may carry."""
+        self.wants_poses = poses
         begin = 1.0 if self.wants_residuals else LIVE_BEGIN
         self.for_points = points
         self.wants_residuals = points or (live and bytes_s >= begin * LIVE_LEAST_BYTES_S)
@@ -121,7 +122,7 @@ class OutgoingBulk:
         return max(left, self._share * bytes_s)
 
     def _next_pose(self, budget_bytes: int, now_ns: int) -> Outgoing | None:
-        chosen = self._scheduler.next_for(self._receiver, budget_bytes, now_ns)
+        chosen = self._scheduler.next_for(self._receiver, budget_bytes, now_ns) if self.wants_poses else None
         if chosen is None:
             return None
         pose_id, payload = chosen

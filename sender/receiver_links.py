@@ -16,7 +16,7 @@ from common.transport.channel_publisher import ChannelPublisher
 from common.transport.channel_query import Question
 from common.transport.channel_subscriber import Arrival
 from common.transport.channels import receiver_of
-from common.wire.receiver_report import WANTS_LIVE, WANTS_RESIDUALS, decode_report
+from common.wire.receiver_report import SPARES_POSES, WANTS_LIVE, WANTS_RESIDUALS, decode_report
 from common.wire.repository_list import RepositoryList, decode_repository_list, encode_repository_list
 from sender.candidate_poses.mesh_scheduler import MeshScheduler, SendRecord
 from sender.outgoing_bulk import Outgoing, OutgoingBulk, pose_name, poses_in
@@ -170,7 +170,8 @@ class ReceiverLinks:
             log.info("receiver %s is back", link.name)
         link.heard_ns = arrival.arrival_ns
         points, live = bool(report.wants & WANTS_RESIDUALS), bool(report.wants & WANTS_LIVE)
-        link.choice.want(points, live, link.bulk.window.allowed_bytes_s)
+        poses = not report.wants & SPARES_POSES
+        link.choice.want(points, live, poses, link.bulk.window.allowed_bytes_s)
         link.skeleton_divisor = report.skeleton_divisor
         link.bulk.window.trickle = report.skeleton_divisor > 1  # its path does not even carry the skeletons
         link.bulk.on_report(report)

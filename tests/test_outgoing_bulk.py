@@ -164,13 +164,24 @@ def test_a_receiver_that_wants_none_costs_poses_nothing():
 
 def test_a_live_surface_takes_a_tenth_and_nothing_of_a_thin_link():
     bench = Bench(0.5)
-    bench.choice.want(points=False, live=True, bytes_s=RATE)
+    bench.choice.want(points=False, live=True, poses=True, bytes_s=RATE)
     bench.run(6.0, None, poses=True)
     both = sum(bench.sent_bytes.values())
     assert bench.sent_bytes["residual"] / both == pytest.approx(LIVE_SHARE, abs=0.04)
     for bytes_s, wanted in ((1.1, True), (0.9, False), (1.1, False), (1.3, True)):  # × the least: no to and fro
-        bench.choice.want(points=False, live=True, bytes_s=bytes_s * LIVE_LEAST_BYTES_S)
+        bench.choice.want(points=False, live=True, poses=True, bytes_s=bytes_s * LIVE_LEAST_BYTES_S)
         assert bench.choice.wants_residuals == wanted
-    bench.choice.want(points=True, live=True, bytes_s=0.1 * LIVE_LEAST_BYTES_S)
+    bench.choice.want(points=True, live=True, poses=True, bytes_s=0.1 * LIVE_LEAST_BYTES_S)
     assert bench.choice.wants_residuals
     assert bench.choice.residual_bytes_s(RATE, 0) >= 0.5 * RATE
+
+
+def test_who_spares_poses_gets_residuals_alone_until_poses_are_wanted_again():
+    bench = Bench()
+    bench.choice.want(points=True, live=False, poses=False, bytes_s=RATE)
+    bench.run(3.0, None, poses=True)
+    assert bench.sent_bytes["pose"] == 0
+    assert bench.sent_bytes["residual"] > 0.9 * 3 * RATE
+    bench.choice.want(points=False, live=False, poses=True, bytes_s=RATE)
+    bench.run(1.0, None, poses=True)
+    assert bench.sent_bytes["pose"] > 0.8 * RATE

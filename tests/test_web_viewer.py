@@ -189,6 +189,7 @@ async def test_points_go_to_pages_that_show_them_newest_first() -> None:
     async with serve() as served, served.page() as of_mesh, served.page() as of_points:
         assert not served.viewer.wants_points
         await of_points.socket.send_str("points")
+        assert served.viewer.wants_poses  # of the other page
         await until(lambda: served.viewer.wants_points)
         for every in (2, 3):
             served.viewer.show_points(link_points(PERSON, every))
@@ -201,6 +202,16 @@ async def test_points_go_to_pages_that_show_them_newest_first() -> None:
         assert await of_points.binaries(1) == [(POINTS, 0)]
         await of_points.socket.send_str("mesh")
         await until(lambda: not served.viewer.wants_points)
+
+
+async def test_while_all_pages_show_points_no_poses_are_wanted() -> None:
+    async with serve() as served:
+        assert served.viewer.wants_poses  # for whoever comes
+        async with served.page() as page:
+            await page.socket.send_str("points")
+            await until(lambda: not served.viewer.wants_poses)
+            await page.socket.send_str("live")
+            await until(lambda: served.viewer.wants_poses)
 
 
 async def test_what_maps_show_goes_once_to_pages_that_show_it_before_its_frame() -> None:

@@ -23,6 +23,7 @@ from common.wire.header import (
 REPORT_MAX_BYTES = 1024
 MAX_MISSING_CHUNKS = 128
 WANTS_RESIDUALS, WANTS_LIVE = 1, 2  # bits of ``wants``: residual maps as points are made of; a few, for a live surface
+SPARES_POSES = 4  # another: it has candidate poses, and nobody looks at them
 MISSING_SPAN = 0xFFFF  # a missing chunk lies at most this far below the next expected one
 REPOSITORY_MAX_POSES = 0xFFFF
 
@@ -44,7 +45,7 @@ class ReceiverReport:
     ``next_chunk``: every chunk below is resolved or in ``missing_chunks`` (rising); with more missing than
     ``MAX_MISSING_CHUNKS`` it is the first one not listed.
     ``body_revision``: of the newest body message held, None: none. ``repository_poses``: candidate poses held.
-    ``wants``: bits, what it has a use for beside candidate poses; bits unknown here mean nothing.
+    ``wants``: bits, what it has a use for beside candidate poses, or instead; bits unknown here mean nothing.
     ``skeleton_divisor``: of the skeletons it takes 1 in so many, since its path carries no more; 1: all.
     """
 

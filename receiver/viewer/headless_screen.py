@@ -27,7 +27,8 @@ def front_camera() -> Camera:
 
 class HeadlessScreen:
     """A ``Viewer`` that renders what it is shown. All methods are the loop's. ``frames_rendered`` counts;
-    ``wants_points``: it has a use for points; ``wants_live``: for what maps show beyond a mesh."""
+    ``wants_points``: it has a use for points; ``wants_live``: for what maps show beyond a mesh;
+    ``wants_poses``: for meshes."""
 
     def __init__(
         self,
@@ -37,7 +38,7 @@ class HeadlessScreen:
         mode: ViewMode = "mesh",
     ) -> None:
         self.frames_rendered = 0
-        self.wants_points, self.wants_live = mode == "points", mode == "live"
+        self.wants_points, self.wants_live, self.wants_poses = mode == "points", mode == "live", mode != "points"
         self._camera = camera or front_camera()
         self._timer = timer
         self._viewer = OffscreenViewer(skinning, mode)

@@ -100,6 +100,11 @@ class WebViewer:
         """Whether a page shows a mesh that follows maps."""
         return any(page.mode == "live" for page in self._pages)
 
+    @property
+    def wants_poses(self) -> bool:
+        """Whether a page shows meshes; while there is none, whoever comes may."""
+        return not self._pages or any(page.mode != "points" for page in self._pages)
+
     def add_pose(self, mesh: RiggedMesh) -> None:
         """Uploads the mesh to every page once; one that cannot be shown (too large a texture) is logged."""
         self._poses[mesh.pose_id] = _HeldPose(mesh)
