@@ -6,6 +6,7 @@ is made of it.
 
 from __future__ import annotations
 
+import asyncio
 import logging
 from collections import Counter
 from collections.abc import Callable, Mapping
@@ -23,6 +24,7 @@ from common.transport.chunks import decode_chunk
 from common.transport.clock_exchange import exchange_times
 from common.transport.clock_offset import ClockOffset
 from common.transport.reception import Reception
+from common.transport.split_session import SplitSession
 from common.transport.temporal_layers import LAYERS
 from common.transport.zenoh_session import ZenohSession
 from common.wire.header import WireError
@@ -35,6 +37,8 @@ from receiver.incoming_stream import IncomingStream
 from receiver.layer_subscription import LayerSubscription
 
 log = logging.getLogger(__name__)
+
+SPLIT_PERIOD_S = 0.25
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,6 +85,7 @@ class ReceiverChannels:
         self.offered_poses = 0  # how many the sender held when it was last asked
         self._report = ChannelPublisher(session, channels.REPORT, self._key(channels.REPORT, name))
         self._handlers: Handlers | None = None
+        self._split = SplitSession()
 
     def open(self, handlers: Handlers) -> None:
         """Listen, and be seen."""
@@ -90,6 +95,7 @@ class ReceiverChannels:
             self.subscribers["skeleton"].add(self._key(channels.SKELETON, layer=layer))
         self._listen(channels.BODY, self._key(channels.BODY), self._on_body)
         self._listen(channels.BULK, self._key(channels.BULK, self._name), self._on_chunk)
+        self._session.watch_links(self._begin_session, lambda up: self._split.link(up, self._clock.now_ns()))
         self._session.declare_presence(self._key(channels.RECEIVER_PRESENCE, self._name))
         self._session.watch_presence(self._key(channels.SENDER_PRESENCE), lambda _, present: handlers.presence(present))
 
@@ -106,6 +112,18 @@ class ReceiverChannels:
         revision = self.stream.body_revision
         report = self._reception.report(now_ns, revision, repository_poses, wants, self._layers.carried_divisor)
         self._report.put(encode_report(report))
+
+    async def keep_session(self) -> None:
+        """Until cancelled: take another session where this one has come apart."""
+        while True:
+            await asyncio.sleep(SPLIT_PERIOD_S)
+            if self._split.is_split(self._clock.now_ns()):
+                self._split = SplitSession()  # where there can be no other session, this is said once
+                log.warning("links are up and nothing comes: another session")
+                await self._session.reopen()
+
+    def _begin_session(self) -> None:
+        self._split = SplitSession()
 
     @property
     def skeleton_divisor(self) -> int:
@@ -172,6 +190,7 @@ class ReceiverChannels:
 
     def _on_skeleton(self, arrival: Arrival) -> None:
         assert self._handlers is not None
+        self._split.heard()
         newest = self.stream.skeleton(arrival.payload, arrival.arrival_ns)
         if newest is None:
             return

@@ -163,6 +163,7 @@ class _Show:
             steadily(STATUS_PERIOD_S, self._tell_status),
             steadily(1 / self._settings.view.display_hz, self._tick, self._on_missed_ticks),
             self._keep_time(),
+            self._channels.keep_session(),
             self._keep_body(),
             self._tell_what_is_here(),
         ]

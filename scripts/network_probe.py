@@ -155,9 +155,10 @@ async def receive(settings: ProbeSettings) -> dict[str, Any]:
                     await channels.ask_body()
                 await asyncio.sleep(REPORT_S)
 
-        task = asyncio.create_task(report())
+        tasks = [asyncio.create_task(part) for part in (report(), channels.keep_session())]
         await until_input_ends(lambda line: None)
-        task.cancel()
+        for task in tasks:
+            task.cancel()
         channels.close()
         counts = channels.stream.skeletons.counts | channels.stream.assembler.counts
         counts["not fresh"] = channels.freshness.stale

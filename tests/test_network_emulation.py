@@ -17,7 +17,7 @@ import pytest
 from scripts.bench_network import CASES, outage, steady
 from scripts.link_model import LinkConditions
 from scripts.network_emulation import EmulatedNetwork, emulated_network, unavailable
-from scripts.network_run import NS, NetworkCase, Seen, probes, run_case
+from scripts.network_run import NS, Change, NetworkCase, Seen, probes, run_case
 
 WHY_NOT = unavailable()
 pytestmark = [pytest.mark.network, pytest.mark.skipif(WHY_NOT is not None, reason=WHY_NOT or "")]
@@ -105,6 +105,22 @@ def test_of_damaged_packets_nothing_is_shown_and_the_links_recover(kind: str, tm
     assert figures["wrong_skeletons_shown"][0] == figures["wrong_meshes_shown"][0] == 0
     assert figures["resume_s"][0] <= 5
     assert figures["bulk_back_s"][0] <= 8
+
+
+@pytest.mark.network_long
+@pytest.mark.usefixtures("asked_for_long")
+def test_a_path_that_was_gone_in_one_direction_for_about_the_lease_does_not_part_the_session(tmp_path: Path) -> None:
+    """Without another session every 5th to 9th of these left the receiver without skeletons for half a minute."""
+    times = [4 + 10 * number for number in range(8)]
+    lengths = [2.6, 2.85, 2.7, 2.8, 2.65, 2.75, 2.9, 2.7]
+    cut = (Change(at, {"outage": True}, "back") for at in times)
+    mended = (Change(at + length, {"outage": False}, "back") for at, length in zip(times, lengths, strict=True))
+    case = NetworkCase(LinkConditions(10e6, 25), "secure", (*cut, *mended), seconds=85)
+    seen = run_case(case, tmp_path)
+    for number, mended_ns in enumerate(seen.changed_ns[1::2]):
+        back = [shown for _, shown in seen.shown if mended_ns + 3 * NS < shown < mended_ns + 6 * NS]
+        assert len(back) > 60, number
+    assert seen.goodput_bps(seen.changed_ns[-1] + 4 * NS, seen.ended_ns) > 1e6
 
 
 @pytest.mark.network_long

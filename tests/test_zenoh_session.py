@@ -208,6 +208,31 @@ async def test_either_end_may_start_first(endpoint: str) -> None:
     assert changes[0].peer == changes[1].peer
 
 
+async def test_another_session_takes_over_all_that_was_declared(endpoint: str) -> None:
+    presence = channel_key(RECEIVER_PRESENCE, "studio", 0, "wall")
+    question, body = channel_key(CLOCK, "studio", 0), channel_key(BODY, "studio", 0)
+    links, sessions, seen = list[bool](), list[str](), list[tuple[str, bool]]()
+    async with AsyncExitStack() as stack:
+        ends = await pair(stack, endpoint)
+        dialler, listener = ends.dialler, ends.listener
+        listener.watch_presence(presence, lambda *change: seen.append(change))
+        dialler.declare_presence(presence)
+        dialler.watch_links(lambda: sessions.append(str(dialler.zenoh.zid())), links.append)
+        there, back = ChannelPublisher(listener, SKELETON, KEY), ChannelPublisher(dialler, BODY, body)
+        inbox, returned = Inbox(dialler), Inbox(listener, BODY, body)
+        ChannelQueryable(dialler, CLOCK, question, lambda _: b"here")
+        await until(lambda: there.heard and links == [True])
+        assert not await listener.reopen()  # its port is in use
+        assert await dialler.reopen()
+        await until(lambda: links == [True, True] and len(set(sessions)) == 2)
+        await until(lambda: there.heard and back.heard)
+        there.put(b"pose")
+        back.put(b"body")
+        await until(lambda: inbox.payloads == [b"pose"] and returned.payloads == [b"body"])
+        assert await ask(listener, CLOCK, question) == [b"here"]
+        await until(lambda: seen[-1] == (presence, True))
+
+
 async def test_presence_is_seen_by_who_came_before_and_who_came_after(endpoint: str) -> None:
     key = channel_key(RECEIVER_PRESENCE, "studio", 0, "wall")
     expression = channel_key(RECEIVER_PRESENCE, "studio", 0, "*")

@@ -17,18 +17,20 @@ class ChannelPublisher:
         self.puts = 0
         self.put_bytes = 0
         self._channel = channel
-        self._publisher = session.zenoh.declare_publisher(
-            key,
-            priority=channel.priority,
-            congestion_control=zenoh.CongestionControl.DROP,
-            reliability=channel.reliability,
-            express=channel.express,
+        self._publisher = session.declare(
+            lambda session: session.declare_publisher(
+                key,
+                priority=channel.priority,
+                congestion_control=zenoh.CongestionControl.DROP,
+                reliability=channel.reliability,
+                express=channel.express,
+            )
         )
 
     @property
     def heard(self) -> bool:
         """Whether anyone subscribes to the key at the moment."""
-        status: Any = self._publisher.matching_status  # its annotation is wrong
+        status: Any = self._publisher.now.matching_status  # its annotation is wrong
         return bool(status.matching)
 
     def put(self, payload: bytes) -> None:
@@ -40,10 +42,10 @@ class ChannelPublisher:
         low, high = self._channel.min_bytes, self._channel.max_bytes
         if not low <= len(payload) <= high:
             raise ValueError(f"{self._channel.name}: {len(payload)} bytes, the channel carries {low}..{high}")
-        self._publisher.put(payload)
+        self._publisher.now.put(payload)
         self.puts += 1
         self.put_bytes += len(payload)
 
     def close(self) -> None:
         """Undeclare the publisher, so that nobody counts on it."""
-        self._publisher.undeclare()  # type: ignore[no-untyped-call]
+        self._publisher.undeclare()

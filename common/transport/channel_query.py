@@ -46,10 +46,12 @@ class ChannelQueryable:
         self._answer = answer
         self._lock = threading.Lock()
         self._waiting = 0
-        self._queryable = session.zenoh.declare_queryable(key, Callback(self._asked, indirect=False), complete=True)
+        self._queryable = session.declare(
+            lambda session: session.declare_queryable(key, Callback(self._asked, indirect=False), complete=True)
+        )
 
     def close(self) -> None:
-        self._queryable.undeclare()  # type: ignore[no-untyped-call]
+        self._queryable.undeclare()
 
     def _asked(self, query: zenoh.Query) -> None:
         payload = query.payload

@@ -12,7 +12,7 @@ from zenoh.handlers import Callback
 
 from common.runtime.clock import Clock
 from common.transport.channels import Channel
-from common.transport.zenoh_session import ZenohSession
+from common.transport.zenoh_session import Declared, ZenohSession
 from common.wire.header import WireError
 
 
@@ -49,13 +49,14 @@ class ChannelSubscriber:
         self._waiting: deque[Arrival] = deque(maxlen=channel.keep)
         self._woken = False
         self._closed = False
-        self._subscribers: dict[str, zenoh.Subscriber[None]] = {}
+        self._subscribers: dict[str, Declared[zenoh.Subscriber[None]]] = {}
         self.add(key)
 
     def add(self, key: str) -> None:
         """Hear what comes under this key as well."""
-        declared = self._session.zenoh.declare_subscriber(key, Callback(self._came, indirect=False))
-        self._subscribers[key] = declared
+        self._subscribers[key] = self._session.declare(
+            lambda session: session.declare_subscriber(key, Callback(self._came, indirect=False))
+        )
 
     def remove(self, key: str) -> None:
         """Hear no more of what comes under a key; others upstream need not send it then.
@@ -63,7 +64,7 @@ class ChannelSubscriber:
         Raises:
             KeyError: it was not heard.
         """
-        self._subscribers.pop(key).undeclare()  # type: ignore[no-untyped-call]
+        self._subscribers.pop(key).undeclare()
 
     def close(self) -> None:
         """Undeclare all; what still waits for the loop is dropped."""

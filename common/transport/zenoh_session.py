@@ -16,7 +16,7 @@ from collections.abc import AsyncIterator, Callable, Iterable
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from typing import Any, TypeVar
+from typing import Any, Generic, TypeVar
 
 import zenoh
 from zenoh.handlers import Callback
@@ -32,6 +32,7 @@ log = logging.getLogger(__name__)
 CLOSE_WITHIN_S = 1.0
 WARN_DAYS = 30  # before a certificate expires
 Result = TypeVar("Result")
+Entity = TypeVar("Entity", bound=Any)  # what Zenoh declares; all of them can be undeclared
 
 
 class TransportError(DaemonError):
@@ -136,25 +137,57 @@ class TransportChange:
     up: bool
 
 
+class Declared(Generic[Entity]):
+    """Something declared with Zenoh: ``now`` with the session there is, anew with each that takes its place."""
+
+    def __init__(self, session: ZenohSession, declare: Callable[[zenoh.Session], Entity]) -> None:
+        self.declare = declare
+        self.now = declare(session.zenoh)
+        self._session = session
+
+    def undeclare(self) -> None:
+        """For good."""
+        self._session.declared.discard(self)
+        self.now.undeclare()
+
+
 class ZenohSession:
-    """An open session. Its callbacks run on the loop that opened it."""
+    """An open session. Its callbacks run on the loop that opened it. ``open_another``: one of the same settings."""
 
     def __init__(
-        self, session: zenoh.Session, loop: asyncio.AbstractEventLoop, certificate: SiteCertificate | None = None
+        self,
+        session: zenoh.Session,
+        loop: asyncio.AbstractEventLoop,
+        certificate: SiteCertificate | None = None,
+        open_another: Callable[[], zenoh.Session] | None = None,
     ) -> None:
         self.zenoh = session
         self.certificate = certificate
         self.loop = loop
-        self._declared: list[Any] = []
+        self.declared: set[Declared[Any]] = set()
+        self._open_another = open_another
 
     def on_loop(self, action: Callable[..., None], *arguments: object) -> None:
         """Have the loop call ``action``; from any thread, also when the loop has closed (nothing happens then)."""
         with contextlib.suppress(RuntimeError):
             self.loop.call_soon_threadsafe(action, *arguments)
 
-    def keep(self, declared: Any) -> None:
-        """Hold on to something declared, so that it lives as long as the session."""
-        self._declared.append(declared)
+    def declare(self, how: Callable[[zenoh.Session], Entity]) -> Declared[Entity]:
+        """Declare something that lives as long as this object, whatever session Zenoh has for it."""
+        made = Declared(self, how)
+        self.declared.add(made)
+        return made
+
+    async def reopen(self) -> bool:
+        """Take another session, with another id, in place of this one; False where it cannot be: who listens has its
+        port in use."""
+        if self._open_another is None:
+            return False
+        before, self.zenoh = self.zenoh, await _in_thread(self._open_another, too_late=_close)
+        for declared in self.declared:
+            declared.now = declared.declare(self.zenoh)
+        await _closed(before)
+        return True
 
     def add_metrics(self, metrics: Metrics) -> None:
         """What an operator has to know of the link."""
@@ -171,11 +204,28 @@ class ZenohSession:
             self.on_loop(on_change, TransportChange(str(event.transport.zid), up))
 
         handler = Callback(happened, indirect=False)
-        self.keep(self.zenoh.info.declare_transport_events_listener(handler, history=True))
+        self.declare(lambda session: session.info.declare_transport_events_listener(handler, history=True))
+
+    def watch_links(self, on_new_session: Callable[[], None], on_change: Callable[[bool], None]) -> None:
+        """Call ``on_change(up)`` for every link that is open now and for every change from now on, after
+        ``on_new_session``, which is called for each session."""
+
+        def listen(session: zenoh.Session) -> zenoh.LinkEventsListener[None]:
+            def happened(event: zenoh.LinkEvent) -> None:
+                self.on_loop(tell, event.kind == zenoh.SampleKind.PUT)
+
+            def tell(up: bool) -> None:
+                if session is self.zenoh:  # one that was replaced loses all its links
+                    on_change(up)
+
+            on_new_session()
+            return session.info.declare_link_events_listener(Callback(happened, indirect=False), history=True)
+
+        self.declare(listen)
 
     def declare_presence(self, key: str) -> None:
         """Others that watch ``key`` see it while this session lives and can be reached."""
-        self.keep(self.zenoh.liveliness().declare_token(key))
+        self.declare(lambda session: session.liveliness().declare_token(key))
 
     def watch_presence(self, key_expression: str, on_change: Callable[[str, bool], None]) -> None:
         """Call ``on_change(key, present)`` for every presence there is now and for every change from now on."""
@@ -184,7 +234,7 @@ class ZenohSession:
             self.on_loop(on_change, str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT)
 
         handler = Callback(happened, indirect=False)
-        self.keep(self.zenoh.liveliness().declare_subscriber(key_expression, handler, history=True))
+        self.declare(lambda session: session.liveliness().declare_subscriber(key_expression, handler, history=True))
 
 
 @asynccontextmanager
@@ -198,6 +248,7 @@ async def open_session(settings: LinkSettings, allowed: Iterable[Allowance] = ()
         CertificateError: the certificate cannot be used.
     """
     certificate = own_certificate(settings)
+    allowed = tuple(allowed)
     config = zenoh_config(settings, certificate, allowed)
     loop = asyncio.get_running_loop()
     try:
@@ -208,17 +259,24 @@ async def open_session(settings: LinkSettings, allowed: Iterable[Allowance] = ()
     log.info("zenoh session %s, listening on: %s, dialling: %s", session.zid(), listening, dialling)
     if certificate is not None and certificate.days_left(datetime.now(UTC)) < WARN_DAYS:
         log.warning("%s: expires on %s", certificate.certificate_file, f"{certificate.expires:%Y-%m-%d %H:%M} UTC")
+    listens = bool(json.loads(config.get_json("listen/endpoints")))
+    another = None if listens else lambda: zenoh.open(zenoh_config(settings, certificate, allowed))
+    opened = ZenohSession(session, loop, certificate, another)
     try:
-        yield ZenohSession(session, loop, certificate)
+        yield opened
     finally:
-        try:
-            # Closing tells the peers, which can take long when they do not answer.
-            async with asyncio.timeout(CLOSE_WITHIN_S):
-                await _in_thread(lambda: _close(session))
-        except TimeoutError:
-            log.warning("zenoh session not closed within %s s, left behind", CLOSE_WITHIN_S)
-        except zenoh.ZError as error:
-            log.warning("zenoh session: %s", _first_line(error))
+        await _closed(opened.zenoh)
+
+
+async def _closed(session: zenoh.Session) -> None:
+    try:
+        # Closing tells the peers, which can take long when they do not answer.
+        async with asyncio.timeout(CLOSE_WITHIN_S):
+            await _in_thread(lambda: _close(session))
+    except TimeoutError:
+        log.warning("zenoh session not closed within %s s, left behind", CLOSE_WITHIN_S)
+    except zenoh.ZError as error:
+        log.warning("zenoh session: %s", _first_line(error))
 
 
 async def _in_thread(call: Callable[[], Result], too_late: Callable[[Result], object] | None = None) -> Result:
