@@ -32,7 +32,7 @@ from sender.capture.rig_layout import RigSettings
 from sender.capture.rig_process import RigRenderer
 from sender.fitting.initial_pose import InitialPose
 from sender.fitting.initial_pose_search import InitialPoseSearch
-from sender.reconstruction.background import BackgroundModel, BackgroundSettings
+from sender.reconstruction.background import BackgroundModel
 from sender.reconstruction.foreground_points import PointSampler
 
 Array = NDArray[Any]
@@ -128,7 +128,10 @@ def _camera_clouds(performer: Turned, begin_s: float) -> dict[str, list[PointClo
     """What all four cameras, two and one of them make of the person."""
     renderer = RigRenderer(performer, RigSettings(cameras=4))
     cameras = renderer.cameras
-    backgrounds = [BackgroundModel(c, renderer.empty_room(i), BackgroundSettings()) for i, c in enumerate(cameras)]
+    backgrounds = [
+        BackgroundModel(c, renderer.empty_room(i), room_colour=renderer.empty_room_colour(i))
+        for i, c in enumerate(cameras)
+    ]
     sampler = PointSampler(cameras, POINTS)
     clouds: dict[str, list[PointCloud]] = {condition: [] for condition in VIEWS}
     for number, time_s in enumerate(_times(begin_s)):

@@ -23,7 +23,7 @@ from sender.capture.performer import Performer, open_performer
 from sender.capture.rig_layout import RigSettings
 from sender.capture.rig_process import RigRenderer
 from sender.fitting.open_tracker import open_tracker
-from sender.reconstruction.background import BackgroundModel, BackgroundSettings
+from sender.reconstruction.background import BackgroundModel
 from sender.reconstruction.foreground_points import PointSampler
 
 FRAME_RATE_HZ = 30
@@ -104,7 +104,7 @@ def _captured(
 ) -> list[CapturedFrame]:
     truth = TrueSkeleton(performer)
     rooms = [
-        BackgroundModel(camera, renderer.empty_room(index), BackgroundSettings())
+        BackgroundModel(camera, renderer.empty_room(index), room_colour=renderer.empty_room_colour(index))
         for index, camera in enumerate(renderer.cameras)
     ]
     sampler = PointSampler(renderer.cameras, POINTS)

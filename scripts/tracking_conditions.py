@@ -32,7 +32,7 @@ from sender.capture.performer import open_performer
 from sender.capture.rig_layout import RigSettings
 from sender.capture.rig_process import RigRenderer
 from sender.capture.skinned_body import PerformerMesh
-from sender.reconstruction.background import BackgroundModel, BackgroundSettings
+from sender.reconstruction.background import BackgroundModel
 from sender.reconstruction.foreground_points import PointSampler
 
 Array = NDArray[Any]
@@ -127,7 +127,9 @@ class DepthRig:
     def __init__(self, performer: BodyPerformer, cameras: int) -> None:
         self._renderer = RigRenderer(performer, RigSettings(cameras=cameras))
         self._backgrounds = [
-            BackgroundModel(camera, self._renderer.empty_room(index), BackgroundSettings())
+            BackgroundModel(
+                camera, self._renderer.empty_room(index), room_colour=self._renderer.empty_room_colour(index)
+            )
             for index, camera in enumerate(self._renderer.cameras)
         ]
         self._sampler = PointSampler(self._renderer.cameras, POINTS)

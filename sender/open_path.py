@@ -26,7 +26,9 @@ def open_skeleton_path(
     """The fast path before ``source``'s cameras, or its sensors (``outside``)."""
     given = source.cameras, source.empty_room, settings.points
     inside = settings.tracker == "particles"
-    reconstruction = DepthReconstruction(*given) if source.has_depth else HullReconstruction(*given, inside)
+    reconstruction = (
+        DepthReconstruction(*given, source.room_colour) if source.has_depth else HullReconstruction(*given, inside)
+    )
     rate_hz = source.frame_rate_hz
     return SkeletonPath(identity, reconstruction, tracker, rate_hz, timer, clock, source.start_joints, outside)
 

@@ -49,9 +49,10 @@ def skeleton_path(tracker: GaussNewtonTracker | None = None) -> SkeletonPath:
     """The sender's fast path before those cameras."""
     cameras = renderer().cameras
     rooms = [renderer().empty_room(index) for index in range(len(cameras))]
+    pictures = [renderer().empty_room_colour(index) for index in range(len(cameras))]
     return SkeletonPath(
         IDENTITY,
-        DepthReconstruction(cameras, rooms),
+        DepthReconstruction(cameras, rooms, room_colour=pictures),
         tracker or GaussNewtonTracker(GaussNewtonSettings()),
         RATE_HZ,
         StageTimer(ManualClock()),

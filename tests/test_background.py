@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from common.geometry.camera_model import Camera
 from sender.capture.frame_set import DepthFrame
 from sender.reconstruction.background import UPDATE_STRIPES, BackgroundModel, BackgroundSettings, shaded
+from sender.reconstruction.outline import REACH
 
 UTD_MHAD = Path(__file__).parents[1] / "../shared/data/rgbd/utd_mhad/Depth"
 W, H = 160, 120
@@ -61,8 +62,8 @@ def test_view_is_the_bounding_box_with_its_colour() -> None:
     assert view is not None
     assert view.u0 <= 51 - 2
     assert view.v0 <= 30 - 2
-    assert view.depth_mm.shape[0] <= 61 + 8
-    assert view.depth_mm.shape[1] <= 47 + 8
+    assert view.depth_mm.shape[0] <= 61 + 2 * (REACH + 1) + 4
+    assert view.depth_mm.shape[1] <= 47 + 2 * (REACH + 1) + 4
     h, w = view.depth_mm.shape
     np.testing.assert_array_equal(view.colour, colour[view.v0 : view.v0 + h, view.u0 : view.u0 + w])
     assert view.depth_mm.flags.c_contiguous

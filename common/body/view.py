@@ -17,6 +17,7 @@ class View:
     ``u0, v0``: pixel of the crop's top left corner in the camera's image.
     ``depth_mm`` (h, w) uint16 [mm along the optical axis], 0 = not the person.
     ``colour`` (h, w, 3) uint8 RGB, registered to the depth.
+    ``complete``: its outline was found in colour, too, so that nothing of the person is missing at it.
     """
 
     camera: Camera
@@ -24,6 +25,7 @@ class View:
     v0: int
     depth_mm: NDArray[np.uint16]
     colour: NDArray[np.uint8]
+    complete: bool = False
 
     def __post_init__(self) -> None:
         h, w = self.depth_mm.shape

@@ -57,6 +57,7 @@ class CalibratedVideos:
             None if isinstance(images, _Silhouettes) else _room(path / camera.name / "background.avi", camera)
             for images, camera in zip(self._images, self.cameras, strict=True)
         )
+        self.room_colour = (None,) * len(self.cameras)
         numbers = [(number, camera) for camera, images in enumerate(self._images) for number in images.numbers]
         first = min(numbers)[0]
         self.frames = tuple((round((n - first) * 1e9 / self.frame_rate_hz), camera, n) for n, camera in sorted(numbers))

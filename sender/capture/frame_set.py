@@ -76,7 +76,8 @@ class FrameSource(Protocol):
     it raises ``EndOfFrames`` when there will be no more and ``CaptureError`` when the source broke.
     ``has_depth``: whether its frames are ``DepthFrame``s; else they are ``ColourFrame``s.
     ``empty_room`` shows each camera's view without a person, where the source has it: the depth (H, W) uint16 mm, or
-    frames (F, H, W, 3) uint8 RGB of a colour camera.
+    frames (F, H, W, 3) uint8 RGB of a colour camera. ``room_colour``: its picture (H, W, 3) uint8 RGB without a person,
+    of a depth camera of which the source has that, too.
     ``start_joints`` (16, 3) [m, world; ``NAMED_JOINTS`` order] are the person's joints in the first frame, where the
     source knows them, as a sensor with a tracker of its own does.
     """
@@ -87,6 +88,8 @@ class FrameSource(Protocol):
     def has_depth(self) -> bool: ...
     @property
     def empty_room(self) -> tuple[NDArray[Any] | None, ...]: ...
+    @property
+    def room_colour(self) -> tuple[NDArray[np.uint8] | None, ...]: ...
     @property
     def frame_rate_hz(self) -> float: ...
     @property

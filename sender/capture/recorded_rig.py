@@ -25,8 +25,8 @@ Images = tuple[NDArray[Any] | None, NDArray[np.uint8] | None]
 
 
 class Recording(Protocol):
-    """What a folder or file holds. ``frames`` is the index of (time_ns, camera, number), sorted; ``has_depth`` and
-    ``empty_room`` as a ``FrameSource``'s."""
+    """What a folder or file holds. ``frames`` is the index of (time_ns, camera, number), sorted; ``has_depth``,
+    ``empty_room`` and ``room_colour`` as a ``FrameSource``'s."""
 
     @property
     def cameras(self) -> tuple[Camera, ...]: ...
@@ -34,6 +34,8 @@ class Recording(Protocol):
     def has_depth(self) -> bool: ...
     @property
     def empty_room(self) -> tuple[NDArray[Any] | None, ...]: ...
+    @property
+    def room_colour(self) -> tuple[NDArray[np.uint8] | None, ...]: ...
     @property
     def frame_rate_hz(self) -> float: ...
     @property
@@ -103,6 +105,10 @@ class RecordedRig:
     @property
     def empty_room(self) -> tuple[NDArray[Any] | None, ...]:
         return self._recording.empty_room
+
+    @property
+    def room_colour(self) -> tuple[NDArray[np.uint8] | None, ...]:
+        return self._recording.room_colour
 
     @property
     def frame_rate_hz(self) -> float:

@@ -22,6 +22,7 @@ class RecordedSkeletons:
 
     cameras: tuple[Camera, ...] = ()
     empty_room: tuple[NDArray[np.uint16] | None, ...] = ()
+    room_colour: tuple[NDArray[np.uint8] | None, ...] = ()
     start_joints: NDArray[np.floating] | None = None
     has_depth = False
 

@@ -89,6 +89,8 @@ class RecordingFolder:
             self.has_depth = _all_have_depth(self._folders)
             pairs = zip(self._folders, content["cameras"], strict=True)
             self.empty_room = tuple(_empty_room(path, record, folder) for folder, record in pairs)
+            pairs = zip(self._folders, content["cameras"], strict=True)
+            self.room_colour = tuple(_room_colour(path, record, folder) for folder, record in pairs)
             self.start_joints = _start_joints(content.get("start_joints"))
             times = [_times(f, r, self.frame_rate_hz) for f, r in zip(self._folders, content["cameras"], strict=True)]
         except KeyError as error:
@@ -134,6 +136,7 @@ class DepthkitFolder:
         self._folder = folder
         self.start_joints: NDArray[np.floating] | None = None
         self.empty_room: tuple[NDArray[np.uint16] | None, ...] = (None,)
+        self.room_colour = (None,)
         self.frames = _index([{n: round((n - numbers[0]) * 1e9 / self.frame_rate_hz) for n in numbers}])
 
     def load(self, camera_index: int, number: int) -> tuple[NDArray[Any] | None, NDArray[np.uint8] | None]:
@@ -164,6 +167,7 @@ def write_recording(
     frames: Iterable[Frame],
     frame_rate_hz: float,
     empty_room: Sequence[NDArray[Any] | None] = (),
+    room_colour: Sequence[NDArray[np.uint8] | None] = (),
 ) -> None:
     """Write frames as a recording in our format into the new or empty folder ``path``; times are kept.
 
@@ -179,6 +183,10 @@ def write_recording(
         if room is not None:
             records[-1]["empty_room"] = f"{camera.name}/empty_room.png"
             _write(path / records[-1]["empty_room"], room if room.ndim == 2 else _reversed(room[0]))
+        picture = room_colour[index] if index < len(room_colour) else None
+        if picture is not None:
+            records[-1]["room_colour"] = f"{camera.name}/room_colour.png"
+            _write(path / records[-1]["room_colour"], _reversed(picture))
     start_ns: int | None = None
     for frame in frames:
         start_ns = frame.capture_ns if start_ns is None else start_ns
@@ -260,6 +268,11 @@ def _empty_room(path: Path, record: dict[str, Any], folder: _CameraFolder) -> ND
         return None
     file = inside(path, name)
     return read_depth(file, folder.camera) if folder.kind == "depth" else read_colour(file, folder.camera)[None]
+
+
+def _room_colour(path: Path, record: dict[str, Any], folder: _CameraFolder) -> NDArray[np.uint8] | None:
+    name = record.get("room_colour")
+    return None if name is None else read_colour(inside(path, name), folder.camera)
 
 
 def _times(folder: _CameraFolder, record: dict[str, Any], rate_hz: float) -> dict[int, int]:

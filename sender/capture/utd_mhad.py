@@ -53,6 +53,7 @@ class UtdMhadSequence:
         except ValueError as error:
             raise CaptureError(f"{self.path}: {error}") from None
         self.empty_room: tuple[NDArray[np.uint16] | None, ...] = (None,)
+        self.room_colour = (None,)
         self.frames = tuple((round(number * 1e9 / FRAME_RATE_HZ), 0, number) for number in range(count))
 
     def load(self, camera_index: int, number: int) -> tuple[NDArray[np.uint16], None]:

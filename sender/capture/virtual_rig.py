@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import IO, Any
 
 import msgpack
+import numpy as np
 from numpy.typing import NDArray
 
 import sender
@@ -94,6 +95,10 @@ class VirtualRig:
     @property
     def empty_room(self) -> tuple[NDArray[Any] | None, ...]:
         return self._rooms
+
+    @property
+    def room_colour(self) -> tuple[NDArray[np.uint8] | None, ...]:
+        return self._room_colours
 
     @property
     def frame_rate_hz(self) -> float:
@@ -194,6 +199,7 @@ class VirtualRig:
         self._ring = FrameRing.attach(descriptor, RingLayout(len(self._cameras), hello["slots"], width, height))
         rooms = [self._ring.room(index) for index in range(len(self._cameras))]
         self._rooms = tuple(depth.copy() if self._has_depth else colour[None].copy() for depth, colour in rooms)
+        self._room_colours = tuple(colour.copy() if self._has_depth else None for _, colour in rooms)
 
 
 class RigProcess:

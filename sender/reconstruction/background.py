@@ -2,7 +2,7 @@
 
 A modified Gaussian average (Lien 2009 §6.1; Piccardi 2004): mean and variance of the empty room per pixel, updated
 slowly and only where the background shows. A person stands in front of the room, so a pixel is foreground when it is
-nearer than the mean by more than k σ, never when it is farther.
+nearer than the mean by more than k σ, never when it is farther. Cameras with colour complete the outline by it.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from common.body.view import View
 from common.geometry.camera_model import Camera
 from sender.capture.frame_set import DepthFrame
+from sender.reconstruction.outline import REACH, RoomColour
 
 UPDATE_STRIPES = 8  # a frame updates every eighth row: the model is slow anyway, and this keeps it cheap
 
@@ -27,7 +28,8 @@ class BackgroundSettings:
     ``noise_mm, noise_mm_per_m2``: the sensor's σ at depth z [m] is noise_mm + noise_mm_per_m2·z²: where the model's σ
     starts, and its lower bound. ``learning_rate``: weight of one reading in the mean. ``range_limit_mm``: how far
     neighbours on one surface may differ in depth, per metre of depth. ``minimum_pixels``: smaller islands are
-    speckles. ``smooth``: average each depth with its neighbours. ``margin_px``: border of the crop.
+    speckles. ``smooth``: average each depth with its neighbours. ``margin_px``: border of the crop, in which an
+    outline that depth missed is found.
     """
 
     near_m: float = 0.3
@@ -39,7 +41,7 @@ class BackgroundSettings:
     range_limit_mm: float = 20.0
     minimum_pixels: int = 100
     smooth: bool = True
-    margin_px: int = 2
+    margin_px: int = REACH + 1
 
 
 @njit(nogil=True, cache=True)
@@ -138,6 +140,7 @@ class BackgroundModel:
 
     ``empty_room`` (H, W) uint16 [mm]: depth without the person, 0 = nothing there within range. None: the source has
     removed the background itself, every reading between ``near_m`` and ``far_m`` is the person.
+    ``room_colour`` (H, W, 3) uint8 RGB: the same without depth; None: it is learned, beside the person.
 
     Raises:
         ValueError: the empty room does not have the camera's size.
@@ -148,13 +151,17 @@ class BackgroundModel:
         camera: Camera,
         empty_room: NDArray[np.uint16] | None,
         settings: BackgroundSettings | None = None,
+        room_colour: NDArray[np.uint8] | None = None,
     ) -> None:
         self._camera = camera
         self._settings = s = settings or BackgroundSettings()
         shape = (camera.height, camera.width)
         if empty_room is not None and empty_room.shape != shape:
             raise ValueError(f"camera {camera.name}: empty room {empty_room.shape}, images {shape}")
+        if room_colour is not None and room_colour.shape != (*shape, 3):
+            raise ValueError(f"camera {camera.name}: room's colour {room_colour.shape}, images {shape}")
         self._learns = empty_room is not None
+        self._room_colour = RoomColour(*shape, room_colour) if self._learns else None
         self._mean = (
             np.zeros(shape, np.float32) if empty_room is None else _without_holes(empty_room).astype(np.float32)
         )
@@ -180,6 +187,8 @@ class BackgroundModel:
         labels, keep, box = self._components(mask)
         if self._learns:
             self._learn(depth)
+        if self._room_colour is not None and frame.colour is not None:
+            self._room_colour.learn(frame.colour, box)
         if box is None:
             return None
         u0, v0, w, h = box
@@ -188,10 +197,12 @@ class BackgroundModel:
         person = np.empty((h, w), np.uint16)
         _filter(cut, np.float32(s.range_limit_mm / 1000), s.smooth, person)
         if frame.colour is None:
-            colour = shaded(camera, person)
-        else:
-            colour = np.ascontiguousarray(frame.colour[v0 : v0 + h, u0 : u0 + w])
-        return View(camera, u0, v0, person, colour)
+            return View(camera, u0, v0, person, shaded(camera, person))
+        colour = np.ascontiguousarray(frame.colour[v0 : v0 + h, u0 : u0 + w])
+        if self._room_colour is None or not self._room_colour.steady:
+            return View(camera, u0, v0, person, colour)
+        completed = self._room_colour.completed(person, depth, frame.colour, box, s.range_limit_mm / 1000)
+        return View(camera, u0, v0, completed, colour, complete=True)
 
     def _components(
         self, mask: NDArray[np.uint8]

@@ -31,7 +31,7 @@ REGISTRATION_GATE_MM = 50.0  # readings farther from where they are expected are
 # A registration trusts the skeletons to so much, against readings that are off by NOISE_MM: a link seen by few pixels
 # stays where the skeleton has it.
 NOISE_MM, SHIFT_MM, TURN_RAD = 14.0, 10.0, 0.08
-SEEN_IN = 0.7  # of the other frames a pixel must have a reading that is missing in the frame itself
+SEEN_IN = 0.7  # of the other frames a pixel must have a reading that an incomplete frame itself lacks
 _PRIOR = np.diag(NOISE_MM**2 / np.array([TURN_RAD] * 3 + [SHIFT_MM] * 3) ** 2)
 GATE_PER_MM2 = 5e-6  # readings averaged lie within so much · depth² of the surface: a sensor's noise grows so
 ROUNDNESS_PER_MM2 = 1e-6  # means take at most so much · depth² off a limb: its curvature times a pixel's size squared
@@ -102,7 +102,9 @@ class DepthFusion:
         for (then, _), registered, shift in zip(pairs, motion.astype(np.float32), shifts, strict=True):
             _gather(surface, rays, links, then.depth_mm, registered, focal, shift, total, count)
         mean = surface + total / np.maximum(count, 1)
-        there = (view.depth_mm > 0) | (count >= SEEN_IN * len(pairs))
+        there = view.depth_mm > 0
+        if not view.complete:
+            there |= count >= SEEN_IN * len(pairs)
         depth = np.where(there & (surface > 0), np.clip(np.rint(mean), 1, 65535), 0).astype(np.uint16)
         return replace(view, depth_mm=_sharpened(depth))
 

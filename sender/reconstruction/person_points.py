@@ -45,10 +45,15 @@ class DepthReconstruction:
     """Depth cameras: what stands before the background, sampled."""
 
     def __init__(
-        self, cameras: Sequence[Camera], empty_room: Sequence[NDArray[Any] | None], points: int = 2500
+        self,
+        cameras: Sequence[Camera],
+        empty_room: Sequence[NDArray[Any] | None],
+        points: int = 2500,
+        room_colour: Sequence[NDArray[np.uint8] | None] | None = None,
     ) -> None:
-        rooms = zip(cameras, empty_room, strict=True)
-        self._backgrounds = [BackgroundModel(camera, room) for camera, room in rooms]
+        pictures = (None,) * len(cameras) if room_colour is None else room_colour
+        rooms = zip(cameras, empty_room, pictures, strict=True)
+        self._backgrounds = [BackgroundModel(camera, room, room_colour=picture) for camera, room, picture in rooms]
         self._sampler = PointSampler(cameras, points)
 
     def person(self, frames: FrameSet, last_joints: NDArray[np.floating] | None, timer: StageTimer) -> PersonPoints:
