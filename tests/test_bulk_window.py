@@ -215,6 +215,22 @@ def test_when_the_last_chunks_are_lost_a_full_window_probes() -> None:
     assert window.next_send_ns(size, now_ns + 50 * MS) is None  # one at a time
 
 
+def test_what_a_stall_held_up_does_not_look_like_a_faster_path() -> None:
+    """TCP that waits for a lost packet delivers nothing for some reports, and then all at once."""
+    window, size, arrived, number = BulkWindow(EPOCH), 1200, 0, 1
+    window.on_report(report(0), 0)
+    for step in range(1, 800):
+        now_ns = step * 5 * MS
+        while (when_ns := window.next_send_ns(size, now_ns)) is not None and when_ns <= now_ns:
+            window.on_sent(size, now_ns)
+        if step % 40 == 0:  # at most 100 chunks in 200 ms
+            arrived = min(arrived + 100, window.next_sequence)
+        if step % 10 == 0:
+            number += 1
+            window.on_report(replace(report(now_ns, number), next_chunk=arrived), now_ns)
+    assert 0.5 * 100 * size / 0.2 < window.rate_bytes_s <= 100 * size / 0.2
+
+
 def test_each_chunk_is_resolved_once_and_what_is_lost_is_sent_again() -> None:
     run = BulkSimulation(replace(TEN_MEGABIT, loss=0.05)).run(10)
     assert run.window.counts["lost"] == run.sender.repeated > 0

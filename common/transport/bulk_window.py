@@ -86,6 +86,7 @@ class BulkWindow:
         self._last: tuple[ReceiverReport, int] | None = None  # and when it came
         self._path = PathDelay()
         self._rates: deque[float] = deque(maxlen=40)  # R_i [bytes/s]
+        self._rate_from_ns = 0  # receiver's clock: since when the next chunks to be acknowledged have been on their way
         self._suspects: set[int] = set()  # missing in the last report: late, or lost
         self._begin_slow_start(FIRST_WINDOW_BYTES)
 
@@ -180,6 +181,7 @@ class BulkWindow:
         was_silent = self._silent(now_ns)
         before, self._last = self._last, (report, now_ns)
         if before is not None and before[0].receiver_epoch != report.receiver_epoch:
+            self._rate_from_ns = report.clock_ns
             return self._on_restart()
         if report.sender_epoch != self._epoch:
             return Outcome()  # it has not heard of this run yet; but it is there
@@ -197,9 +199,12 @@ class BulkWindow:
             # Otherwise the sample says nothing about the path.
             limited = outstanding > min(self._window / 2, self._window - self.chunk_bytes)
             if acked and limited and before is not None:
-                period_s = max((report.clock_ns - before[0].clock_ns) * NS, self._period_s / 4)
+                period_s = max((report.clock_ns - self._rate_from_ns) * NS, self._period_s / 4)
                 self._rates.append(acked / period_s)
             self._adapt(acked if limited else 0, now_ns)
+        if acked or not outstanding:
+            # TCP that waits for a lost packet delivers nothing and then all at once: the wait is part of the rate.
+            self._rate_from_ns = report.clock_ns
         self._heed_losses(acked, outstanding - self._in_flight_bytes - acked, now_ns)
         return outcome
 
