@@ -49,7 +49,7 @@ class LivePath:
         """What ``mesh``, moved by ``motion`` (L, 3, 4) to ``T_world_link`` (L, 4, 4), is to follow, and how much of it:
         0..1. ``epoch`` and capture time ``now_ns`` are the skeleton's."""
         maps = self._maps
-        fresh = maps is not None and maps.header.epoch == epoch and now_ns - maps.header.capture_ns < STALE_NS
+        fresh = maps is not None and maps.header.epoch == epoch and abs(now_ns - maps.header.capture_ns) < STALE_NS
         strength = self._faded(fresh, now_ns)
         if not fresh:
             maps = None if self._surface is None else self._surface[1]  # those it fades out with
