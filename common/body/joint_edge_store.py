@@ -48,16 +48,17 @@ class JointEdgeStore:
         self._make_room(len(edges), len(edges.pair_links))
         run = slice(self._edges, self._edges + len(edges))
         pairs = slice(self._pairs, self._pairs + len(edges.pair_links))
-        self._points[:, run], self._rest[run] = edges.points, edges.rest_lengths
         regions = max(int(np.count_nonzero(edges.region_lengths)), 1)
         with np.errstate(divide="ignore"):
             per_metre = np.where(edges.region_lengths > 0, self._weights / edges.region_lengths / regions, 0)
-        weights = per_metre[edges.pair_regions].sum(axis=1)
-        pair_of = np.repeat(np.arange(len(weights)), np.diff(edges.pair_starts))
-        order = np.argsort(-weights * np.bincount(pair_of, edges.rest_lengths, len(weights)))
+        weights, sizes = per_metre[edges.pair_regions].sum(axis=1), np.diff(edges.pair_starts)
+        pair_of = np.repeat(np.arange(len(sizes)), sizes)
+        order = np.argsort(-weights * np.bincount(pair_of, edges.rest_lengths, len(sizes)))
+        in_order = np.argsort(np.argsort(order)[pair_of], kind="stable")
+        self._points[:, run], self._rest[run] = edges.points[:, in_order], edges.rest_lengths[in_order]
         self._links[pairs], self._pair_weights[pairs] = edges.pair_links[order], weights[order]
-        self._pair_edges[pairs, 0] = run.start + edges.pair_starts[:-1][order]
-        self._pair_edges[pairs, 1] = run.start + edges.pair_starts[1:][order]
+        self._pair_edges[pairs, 1] = run.start + np.cumsum(sizes[order])
+        self._pair_edges[pairs, 0] = self._pair_edges[pairs, 1] - sizes[order]
         self._runs[pose_id] = run, pairs
         self._edges, self._pairs = run.stop, pairs.stop
         self._edges_held += len(edges)
