@@ -11,6 +11,7 @@ import logging
 import secrets
 from collections import Counter
 from collections.abc import Coroutine
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -69,13 +70,14 @@ class ReceiverDaemon:
             DaemonError: a port or file that cannot be used; the message says which.
         """
         settings = self._settings
+        rehearsal = ThreadPoolExecutor(1, "rehearsal").submit(rehearse)  # while the session opens
         link = with_endpoints(settings.link, "receiver")
         certificate = own_certificate(link)
         name = settings.name or secrets.token_hex(4)
         if certificate is not None:
             name = receiver_name(certificate.name, name)
         async with open_session(link, for_receiver(settings.site, name, link.mode == "client")) as session:
-            show = _Show(settings, name, session, self._clock, self._health)
+            show = _Show(settings, name, session, self._clock, self._health, rehearsal)
             http = settings.http
             app = daemon_app(show.metrics, self._health, read_token(http))
             tls = tls_context(http)
@@ -98,7 +100,13 @@ class _Show:
     """One run with one open session."""
 
     def __init__(
-        self, settings: ReceiverSettings, name: str, session: ZenohSession, clock: MonotonicClock, health: Health
+        self,
+        settings: ReceiverSettings,
+        name: str,
+        session: ZenohSession,
+        clock: MonotonicClock,
+        health: Health,
+        rehearsal: Future[None],
     ) -> None:
         self._settings = settings
         self._clock = clock
@@ -118,7 +126,7 @@ class _Show:
         )
         self._state = StreamState(clock)
         self._animation_path = AnimationPath(settings.repository, self._timer, clock)
-        self._animation = ComputeWorker("animation", self._animation_path.show, self._on_shown, rehearse)
+        self._animation = ComputeWorker("animation", self._animation_path.show, self._on_shown, rehearsal.result)
         self._poses = PoseMaker(settings.person, settings.repository.score_form, self._timer, self._on_mesh)
         self._appeared = asyncio.Event()
         self._newest: SkeletonToShow | None = None

@@ -36,7 +36,7 @@ class PoseMaker:
         self._made = made
         self.received = self.meshed = 0
         self._messages: asyncio.Queue[bytes] = asyncio.Queue(MESHES_WAITING)
-        self._thread = ThreadPoolExecutor(1, "mesher", into_background)
+        self._thread = ThreadPoolExecutor(1, "mesher")
 
     def submit(self, message: bytes) -> None:
         """A pose is complete; when too many wait for meshing the oldest goes."""
@@ -59,6 +59,8 @@ class PoseMaker:
                 log.warning("a candidate pose is refused: %s", error)
                 continue
             self.meshed += 1
+            if self.meshed == 1:  # somebody waits for the first sight; every later mesh gives way to what is shown
+                await loop.run_in_executor(self._thread, into_background)
             while len(self.meshes) >= MESHES_WAITING:  # no skeletons come: nobody takes them
                 self.meshes.popleft()
                 self.counts["mesh waiting too long"] += 1
