@@ -143,6 +143,7 @@ CASES: dict[str, tuple[NetworkCase, Judge]] = {
     "bufferbloat/10M/secure": (ten("secure", queue_ms=2000), steady),
     "shallow/10M/secure": (ten("secure", queue_ms=5), steady),
     "mtu1280/10M/secure": (NetworkCase(LinkConditions(10e6, 25), "secure", mtu=1280), steady),
+    "mtu576/10M/secure": (NetworkCase(LinkConditions(10e6, 25), "secure", mtu=576), steady),
     "10-2-10/50ms/secure": (
         NetworkCase(LinkConditions(10e6, 25, queue_bytes=250_000), "secure", _CUT_AND_RISE, seconds=24),
         after_changes,

@@ -109,6 +109,15 @@ def test_of_damaged_packets_nothing_is_shown_and_the_links_recover(kind: str, tm
 
 @pytest.mark.network_long
 @pytest.mark.usefixtures("asked_for_long")
+def test_a_path_too_narrow_for_quic_is_crossed_by_tls_alone(tmp_path: Path) -> None:
+    case, judge = CASES["mtu576/10M/secure"]
+    figures = judge(case, not_void(run_case(case, tmp_path)))
+    assert figures["skeletons_shown_per_s"][0] > 28
+    assert figures["meshes_whole"][0] > 10
+
+
+@pytest.mark.network_long
+@pytest.mark.usefixtures("asked_for_long")
 def test_a_path_that_was_gone_in_one_direction_for_about_the_lease_does_not_part_the_session(tmp_path: Path) -> None:
     """Without another session every 5th to 9th of these left the receiver without skeletons for half a minute."""
     times = [4 + 10 * number for number in range(8)]
