@@ -11,13 +11,16 @@ from common.body.joint_edges import ScoreForm
 from common.runtime.http_access import HttpSettings
 from common.transport.link_settings import LinkSettings
 
+BLENDED_MAX = 8  # each is drawn twice, thirty times a second
+
 
 @dataclass(frozen=True, slots=True)
 class RepositorySettings:
     """The candidate poses kept (DISPOSE §6.2), and which is shown. ``poses``, ``megabytes``, ``search_ms``: bounds; the
     least used leaves first. ``equal_share``: of the session's threshold, is ET. ``search``, ``hold``: as the paper
     has them, or the best of all. ``hysteresis``: the pose on screen stays while no other's σ is lower by this share.
-    ``withhold_factor``: × the threshold, is a σ too high to show; 0: all is shown.
+    ``blended``: the picture is the mean of so many of the best. ``withhold_factor``: × the threshold, is a σ too high
+    to show; 0: all is shown.
     ``region_weights``: ω where it is not the default; ``score_form``: what σ divides by."""
 
     poses: int = 200
@@ -25,6 +28,7 @@ class RepositorySettings:
     search: Literal["threshold", "exhaustive"] = "exhaustive"
     hold: bool = False
     hysteresis: float = 0.0
+    blended: int = 3
     search_ms: float = 5.0
     equal_share: float = 0.5
     withhold_factor: float = 6.0
@@ -36,6 +40,8 @@ class RepositorySettings:
             raise ValueError(f"poses: {self.poses} is outside 1..1000")
         if not 16 <= self.megabytes <= 65_536:
             raise ValueError(f"megabytes: {self.megabytes} is outside 16..65536")
+        if not 1 <= self.blended <= BLENDED_MAX:
+            raise ValueError(f"blended: {self.blended} is outside 1..{BLENDED_MAX}")
         if not 0.1 <= self.search_ms <= 1000:
             raise ValueError(f"search_ms: {self.search_ms} is outside 0.1..1000")
         for name in ("hysteresis", "equal_share"):

@@ -34,7 +34,7 @@ from receiver.live_path import LivePath
 from receiver.repository.pose_repository import PoseRepository, RepositorySettings
 from receiver.repository.pose_selection import PoseSelector, Selection, SelectionSettings
 from receiver.residual_decoder import ResidualDecoder, ResidualMaps, link_points
-from receiver.viewer.viewer import ShownFrame
+from receiver.viewer.viewer import MovedPose, ShownFrame
 
 RESIDUAL_POINTS_MAX = 200_000  # bounds what a packet can make us allocate
 SEARCHES_REMEMBERED = 31  # the median of so many is what a search costs: one that was interrupted says nothing
@@ -121,6 +121,7 @@ class AnimationPath:
                 search=settings.search,
                 hold=settings.hold,
                 hysteresis=settings.hysteresis,
+                blended=settings.blended,
                 withhold_factor=settings.withhold_factor,
             )
         )
@@ -161,12 +162,18 @@ class AnimationPath:
             return replace(self._shown, withheld=True, links=T_world_link[:, :3])  # points are never withheld
         self._repository.count_use(selection.pose_id)
         mesh = self._repository.get(selection.pose_id)
-        frame = _shown_frame(packet, mesh, T_world_link, selection.sigma)
+        others = tuple(self._moved(pose_id, T_world_link) for pose_id in selection.others)
+        frame = replace(_shown_frame(packet, mesh, T_world_link, selection.sigma), others=others)
         assert mesh is not None
         assert frame.motion is not None
         surface, live = self.live.surface(mesh, frame.motion, T_world_link, packet.epoch, packet.capture_ns)
         self._shown = replace(frame, surface=surface, live=live)
         return self._shown
+
+    def _moved(self, pose_id: int, T_world_link: NDArray[np.float32]) -> MovedPose:
+        mesh = self._repository.get(pose_id)
+        assert mesh is not None
+        return MovedPose(pose_id, link_motion(mesh, T_world_link))
 
     def _select(self, T_world_link: NDArray[np.float32]) -> Selection | None:
         begin_ns = self._clock.now_ns()

@@ -20,7 +20,7 @@ from pathlib import Path
 
 import numpy as np
 
-from scripts.fidelity import Fidelity, compare, measuring_cameras
+from scripts.fidelity import Fidelity, centres, compare, finer, measuring_cameras, smooth, smooth_psnr_db
 from scripts.fidelity_capture import FRAME_RATE_HZ, Capture, capture, show_progress
 from scripts.fidelity_link import SKELETON_BYTES
 from scripts.fidelity_methods import Method, Screen
@@ -46,6 +46,14 @@ class Case:
 
     def __str__(self) -> str:
         return f"{self.body}/{self.motion or 'routine'}/{self.cameras}"
+
+
+@dataclass(frozen=True, slots=True)
+class Likeness:
+    """One instant by single samples, and by the pixels' means."""
+
+    fidelity: Fidelity
+    smooth_db: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,8 +144,8 @@ def measured(method: Method, recorded: Capture, seconds: float) -> dict[str, tup
     (``psnr_seen_db``) that of the instant, for which the screen may wait 100 ms: a player shows, of what it has then,
     the newest that is not of a later instant. Where nobody is on screen yet there is nothing to compare."""
     count = int(seconds * FRAME_RATE_HZ)
-    shown: dict[int, Fidelity] = {}
-    seen: dict[int, Fidelity] = {}
+    shown: dict[int, Likeness] = {}
+    seen: dict[int, Likeness] = {}
     first_k, measured_count = None, 0
     screens: deque[Screen | None] = deque(maxlen=SEEN_AFTER + 1)
     for k in range(count):
@@ -165,26 +173,33 @@ def measured(method: Method, recorded: Capture, seconds: float) -> dict[str, tup
     }
 
 
-def _fidelity(screen: Screen, recorded: Capture, k: int) -> Fidelity:
+def _fidelity(screen: Screen, recorded: Capture, k: int) -> Likeness:
     """What is on screen against the truth of frame k."""
     cameras = measuring_cameras(recorded.performer.surface(recorded.frame(k).time_s))
-    return compare(recorded.truth(k), screen.picture(cameras))
+    fine = screen.picture([finer(camera) for camera in cameras])
+    smooth_db = smooth_psnr_db(recorded.smooth_truth(k), [smooth(colour) for colour, _ in fine])
+    return Likeness(compare(recorded.truth(k), [centres(picture) for picture in fine]), smooth_db)
 
 
-def _summary(shown: dict[int, Fidelity], seen: dict[int, Fidelity]) -> dict[str, tuple[float, str]]:
+def _summary(shown: dict[int, Likeness], seen: dict[int, Likeness]) -> dict[str, tuple[float, str]]:
     """Means once the session is warm (of a shorter one, all), and of the cold start."""
     warm_k = WARM_UP_S * FRAME_RATE_HZ
     if not any(k >= warm_k for k in shown):
         warm_k = 0
-    warm = [fidelity for k, fidelity in shown.items() if k >= warm_k]
-    seen_db = [fidelity.psnr_db for k, fidelity in seen.items() if k >= warm_k]
-    cold_db = [fidelity.psnr_db for k, fidelity in shown.items() if k < WARM_UP_S * FRAME_RATE_HZ]
-    cold_seen_db = [fidelity.psnr_db for k, fidelity in seen.items() if k < WARM_UP_S * FRAME_RATE_HZ]
+    warm = [likeness.fidelity for k, likeness in shown.items() if k >= warm_k]
+    smooth_db = [likeness.smooth_db for k, likeness in shown.items() if k >= warm_k]
+    seen_db = [likeness.fidelity.psnr_db for k, likeness in seen.items() if k >= warm_k]
+    seen_smooth_db = [likeness.smooth_db for k, likeness in seen.items() if k >= warm_k]
+    cold_db = [likeness.fidelity.psnr_db for k, likeness in shown.items() if k < WARM_UP_S * FRAME_RATE_HZ]
+    cold_seen_db = [likeness.fidelity.psnr_db for k, likeness in seen.items() if k < WARM_UP_S * FRAME_RATE_HZ]
     psnr_db = [fidelity.psnr_db for fidelity in warm]
     return {
         "psnr_db": (_mean(psnr_db), "dB"),
-        "psnr_p5_db": (float(np.percentile(psnr_db, 5)) if psnr_db else float("nan"), "dB"),
+        "psnr_p5_db": (_p5(psnr_db), "dB"),
         "psnr_seen_db": (_mean(seen_db), "dB"),
+        "psnr_smooth_db": (_mean(smooth_db), "dB"),
+        "psnr_smooth_p5_db": (_p5(smooth_db), "dB"),
+        "psnr_seen_smooth_db": (_mean(seen_smooth_db), "dB"),
         "psnr_inside_db": (_mean([fidelity.psnr_inside_db for fidelity in warm]), "dB"),
         "iou": (_mean([fidelity.iou for fidelity in warm]), "1"),
         "psnr_cold_db": (_mean(cold_db), "dB"),
@@ -194,6 +209,10 @@ def _summary(shown: dict[int, Fidelity], seen: dict[int, Fidelity]) -> dict[str,
 
 def _mean(values: list[float]) -> float:
     return float(np.mean(values)) if values else float("nan")
+
+
+def _p5(values: list[float]) -> float:
+    return float(np.percentile(values, 5)) if values else float("nan")
 
 
 def _bits_per_s(method: Method, seconds: float) -> float:

@@ -11,11 +11,12 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from common.body.view import View
 from common.geometry.rasterizer import render
 from scripts.capture_files import CapturedFrame, load_frames, save_frames
-from scripts.fidelity import Picture, measuring_cameras
+from scripts.fidelity import Picture, centres, finer, measuring_cameras, smooth
 from scripts.true_skeleton import TrueSkeleton
 from sender.capture.frame_set import DepthFrame
 from sender.capture.fundamental_poses import FUNDAMENTAL_S, PREFIX
@@ -30,7 +31,7 @@ FRAME_RATE_HZ = 30
 FRAME_NS = round(1e9 / FRAME_RATE_HZ)
 START_S = 2.0  # start pose and blend
 POINTS = 2500
-TRUTHS_KEPT = 64  # of 10 MB
+TRUTHS_KEPT = 64  # of 14 MB
 
 
 class Capture:
@@ -41,7 +42,7 @@ class Capture:
         self.performer = performer
         self._frames = frames
         self._once = round(once_s * FRAME_RATE_HZ)
-        self._truth: dict[int, list[Picture]] = {}
+        self._truth: dict[int, tuple[list[Picture], list[NDArray[np.uint8]]]] = {}
 
     @property
     def length(self) -> int:
@@ -59,6 +60,13 @@ class Capture:
 
     def truth(self, k: int) -> list[Picture]:
         """The true person at frame k in the six measuring views; kept."""
+        return self._truths(k)[0]
+
+    def smooth_truth(self, k: int) -> list[NDArray[np.uint8]]:
+        """The same as means of several samples a pixel."""
+        return self._truths(k)[1]
+
+    def _truths(self, k: int) -> tuple[list[Picture], list[NDArray[np.uint8]]]:
         index = self.index(k)
         if index not in self._truth:
             if len(self._truth) >= TRUTHS_KEPT:
@@ -66,8 +74,9 @@ class Capture:
             surface = self.performer.surface(self._frames[index].time_s)
             look = self.performer.mesh
             colours = look.vertex_colours if look.uv is None or look.texture is None else (look.uv, look.texture)
-            cameras = measuring_cameras(surface)
-            self._truth[index] = [render(surface, look.faces, colours, camera) for camera in cameras]
+            cameras = [finer(camera) for camera in measuring_cameras(surface)]
+            fine = [render(surface, look.faces, colours, camera) for camera in cameras]
+            self._truth[index] = [centres(picture) for picture in fine], [smooth(colour) for colour, _ in fine]
         return self._truth[index]
 
 

@@ -6,6 +6,7 @@ need every byte.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import partial
 from typing import Literal
 
@@ -27,7 +28,7 @@ from scripts.capture_files import CapturedFrame
 from scripts.fidelity import Picture
 from scripts.fidelity_capture import FRAME_NS, FRAME_RATE_HZ
 from scripts.fidelity_link import ByteLink
-from scripts.fidelity_methods import Dispose, Screen, posed
+from scripts.fidelity_methods import Dispose, Moved, Screen, posed
 from sender.pipeline import BODY_CHANGE_M
 from sender.reconstruction.foreground_points import PointSampler
 from sender.residual_encoder import LevelControl, ResidualEncoder, ResidualFrame, ResidualSettings
@@ -85,8 +86,8 @@ class DisposeLive(Dispose):
         T_world_link = forward_kinematics(body, quantized_pose(pose))
         return ResidualFrame(body, revision, T_world_link, k, k * FRAME_NS, self._sampler.points(captured.views))
 
-    def _show(self, k: int, mesh: RiggedMesh, motion: NDArray[np.float32]) -> None:
-        super()._show(k, mesh, motion)
+    def _show(self, k: int, mesh: RiggedMesh, motion: NDArray[np.float32], others: Sequence[Moved] = ()) -> None:
+        super()._show(k, mesh, motion, others)
         maps, T_world_link = self._decoder.newest, self._T_world_link
         if maps is not None and T_world_link is not None:
             self.screen = Screen(k, partial(live_picture, mesh, motion, maps, T_world_link, self._followed))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Literal, Protocol
@@ -24,6 +24,7 @@ from common.wire.candidate_pose import CandidatePose, encode_candidate_pose
 from common.wire.skeleton_packet import SkeletonPacket
 from receiver.config import RepositorySettings
 from receiver.pipeline import AnimationPath, ReceivedPose, SkeletonToShow, mesh_of
+from receiver.viewer.pose_blending import blended, shares
 from scripts.capture_files import CapturedFrame
 from scripts.fidelity import Picture
 from scripts.fidelity_capture import FRAME_NS, FRAME_RATE_HZ
@@ -86,6 +87,15 @@ class _NoClock:
         return 0
 
 
+Moved = tuple[RiggedMesh, NDArray[np.float32]]  # a mesh and its links' motion
+
+
+def blended_picture(moved: list[Moved], cameras: list[Camera]) -> list[Picture]:
+    """The mean of several meshes' pictures, as the receiver's viewers show it."""
+    pictures = zip(*(animated_picture(*each, cameras) for each in moved), strict=True)
+    return [blended(of_one_camera, shares(len(moved) - 1, 0)) for of_one_camera in pictures]
+
+
 def animated_picture(mesh: RiggedMesh, motion: NDArray[np.float32], cameras: list[Camera]) -> list[Picture]:
     """A mesh moved, seen by the cameras."""
     vertices = animate(mesh, motion)
@@ -111,10 +121,10 @@ class _Animated:
             T_world_link = forward_kinematics(fitted[0], fitted[1])
             self._fusion.remember(PosedViews(k * FRAME_NS, captured.views, T_world_link))
 
-    def _show(self, k: int, mesh: RiggedMesh, motion: NDArray[np.float32]) -> None:
+    def _show(self, k: int, mesh: RiggedMesh, motion: NDArray[np.float32], others: Sequence[Moved] = ()) -> None:
         self.switches += self._on_screen is not None and self._on_screen is not mesh
         self._on_screen = mesh
-        self.screen = Screen(k, partial(animated_picture, mesh, motion))
+        self.screen = Screen(k, partial(blended_picture, [(mesh, motion), *others]))
 
 
 class Dispose(_Animated):
@@ -177,7 +187,8 @@ class Dispose(_Animated):
         shown = self._animation.show(SkeletonToShow(packet, skeleton, self._arrived))
         self._meshes |= {mesh.pose_id: mesh for mesh in shown.added}
         if not shown.frame.withheld and shown.frame.pose_id is not None and shown.frame.motion is not None:
-            self._show(k, self._meshes[shown.frame.pose_id], shown.frame.motion)
+            others = [(self._meshes[other.pose_id], other.motion) for other in shown.frame.others]
+            self._show(k, self._meshes[shown.frame.pose_id], shown.frame.motion, others)
         for pose_id in shown.removed:
             self._meshes.pop(pose_id, None)
 
@@ -269,9 +280,10 @@ class Ceiling(_Animated):
         return animated_picture(mesh_of(encoded, 0).mesh, still, cameras)
 
 
-PAPER = RepositorySettings(search="threshold", hold=True)
+PAPER = RepositorySettings(search="threshold", hold=True, blended=1)
 METHODS: dict[str, Callable[[float, bool], Method]] = {
     "dispose": Dispose,
+    "dispose-alone": lambda rate, own: Dispose(rate, own, RepositorySettings(blended=1)),
     "dispose-paper": lambda rate, own: Dispose(rate, own, PAPER, "paper"),
     "dispose-paper-sender": lambda rate, own: Dispose(rate, own, choice="paper"),
     "dispose-mistold": lambda rate, own: DisposeMistold(rate, own, told=False),

@@ -9,15 +9,14 @@ The paper's printed rmse lacks 1/N; here it is the mean.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
-import cv2
 import numpy as np
 
 from common.geometry.camera_model import Camera
 from common.geometry.point_cloud import PointCloud
 from common.geometry.point_splats import render_points
-from scripts.fidelity import Picture, compare, measuring_cameras
+from scripts.fidelity import Picture, compare, finer, measuring_cameras, smooth
 
 SPLAT_RADIUS_M = 0.012
 SAMPLES = 2  # each way in a pixel
@@ -52,15 +51,5 @@ def likeness(truth: PointCloud, shown: PointCloud, height_m: float, true: list[P
 
 
 def _picture(cloud: PointCloud, camera: Camera) -> Picture:
-    fine = replace(
-        camera,
-        width=SAMPLES * camera.width,
-        height=SAMPLES * camera.height,
-        fx=SAMPLES * camera.fx,
-        fy=SAMPLES * camera.fy,
-        cx=SAMPLES * (camera.cx + 0.5) - 0.5,
-        cy=SAMPLES * (camera.cy + 0.5) - 0.5,
-    )
-    colour, depth = render_points(cloud.positions, cloud.colours, fine, SPLAT_RADIUS_M)
-    mean = cv2.resize(colour, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
-    return np.asarray(mean, np.uint8), np.ascontiguousarray(depth[::SAMPLES, ::SAMPLES])
+    colour, depth = render_points(cloud.positions, cloud.colours, finer(camera, SAMPLES), SPLAT_RADIUS_M)
+    return smooth(colour, SAMPLES), np.ascontiguousarray(depth[::SAMPLES, ::SAMPLES])

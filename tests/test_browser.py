@@ -27,7 +27,7 @@ from common.geometry.camera_model import Camera
 from common.geometry.rasterizer import render
 from common.geometry.rigid_transform import look_at
 from receiver.viewer.offscreen_viewer import OffscreenViewer
-from receiver.viewer.viewer import ConnectionState, ShownFrame, ViewerStatus, ViewMode
+from receiver.viewer.viewer import ConnectionState, MovedPose, ShownFrame, ViewerStatus, ViewMode
 from receiver.viewer.web_viewer import PAGE_FOLDER, WebViewer
 from tests.capsule_person import (
     SHIRT,
@@ -154,6 +154,32 @@ async def test_page_and_offscreen_renderer_agree(skinning: Skinning, person: Rig
     expected = offscreen.render([camera])[0][0]
     assert difference_db(picture, expected) >= 35
     assert page.problems == []
+
+
+async def test_page_and_offscreen_renderer_agree_on_several_poses_mean() -> None:
+    """Two poses whose colours are each other's inverse: their mean is grey. Without a GPU only if asked for."""
+    person = captured_person(7)
+    inverse = dataclasses.replace(person.mesh, texture=255 - person.mesh.texture)
+    frame = shown_frame(person, 2.3)
+    assert frame.motion is not None
+    frame = dataclasses.replace(frame, others=(MovedPose(8, frame.motion),))
+    async with receiver() as (viewer, url):
+        viewer.add_pose(person)
+        viewer.add_pose(dataclasses.replace(person, pose_id=8, mesh=inverse))
+        viewer.set_status(RECEIVING)
+        viewer.show(frame)
+        async with open_page(url, 800, 600) as page:
+            await photograph_when(page, lambda p: coloured(p, SHIRT).sum() > 500)  # one of them
+        async with open_page(url + "?blend", 800, 600) as page:
+            await page.press("h")
+            picture = await photograph_when(page, lambda p: coloured(p, (127, 127, 127)).sum() > 500)
+            camera = await camera_of(page, 800, 600)
+            assert page.problems == []
+    offscreen = OffscreenViewer()
+    offscreen.add_pose(person)
+    offscreen.add_pose(dataclasses.replace(person, pose_id=8, mesh=inverse))
+    offscreen.show(frame)
+    assert difference_db(picture, offscreen.render([camera])[0][0]) >= 35
 
 
 def following(person: RiggedMesh, time_s: float, strength: float) -> ShownFrame:

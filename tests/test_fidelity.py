@@ -4,14 +4,19 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from common.geometry.camera_model import project
+from common.geometry.camera_model import Camera, project
+from common.geometry.rasterizer import render
 from scripts.fidelity import (
     IMAGE_PIXELS,
     bounding_ball_radius,
+    centres,
     compare,
     constant_offsets,
+    finer,
     joint_errors_m,
     measuring_cameras,
+    smooth,
+    smooth_psnr_db,
 )
 
 
@@ -74,3 +79,26 @@ def test_an_error_fixed_in_the_world_does_not_pass_for_an_offset_of_the_link():
 
 def test_bounding_ball():
     assert bounding_ball_radius(np.array([[0, 0, 0], [0, 2.0, 0]])) == 1.0
+
+
+def test_a_finer_camera_s_centres_are_what_the_camera_sees_and_its_means_are_smooth() -> None:
+    """A slanted half-plane, black on white: single samples are black or white, means are what of a pixel is covered."""
+    camera = Camera("c", 40, 30, 30.0, 30.0, 19.5, 14.5, np.eye(4))
+    corners = np.array([[-9, -9, 2], [0.1, -9, 2], [-9, 9, 2], [0.9, 9, 2]], np.float32)
+    faces = np.array([[0, 1, 2], [2, 1, 3]], np.int32)
+    surface = corners, faces, np.zeros((4, 3), np.uint8)
+    colour, depth = render(*surface, camera)
+    fine = render(*surface, finer(camera))
+    np.testing.assert_array_equal(centres(fine)[0], colour)
+    np.testing.assert_array_equal(centres(fine)[1] > 0, depth > 0)
+    means = smooth(fine[0])
+    edge = (means > 0) & (means < 255)
+    assert edge.any()
+    assert set(np.unique(colour)) == {0, 255}
+    assert abs(means.astype(int) - colour).max() < 160  # at most half a pixel, and a sample more
+
+
+def test_smooth_psnr_is_of_the_mean_square_over_all_views() -> None:
+    black, grey = np.zeros((4, 4, 3), np.uint8), np.full((4, 4, 3), 10, np.uint8)
+    assert smooth_psnr_db([black, black], [grey, black]) == pytest.approx(10 * np.log10(255**2 / 50))
+    assert smooth_psnr_db([grey], [grey]) == 99.0

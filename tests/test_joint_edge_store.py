@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -39,16 +40,18 @@ def test_it_stops_at_the_first_below_the_limit() -> None:
     assert len(store.scores([], TARGET)) == 0
 
 
-def test_looking_for_the_best_only_finds_the_same_best() -> None:
+@pytest.mark.parametrize("best", [1, 3, 12])
+def test_looking_for_the_best_only_finds_the_same_best(best: int) -> None:
     store, ids = filled(range(12)), list(range(12))
     for angle in np.linspace(0.1, 1.4, 9):
         target = links_of(arms_down_by(angle))
-        whole, given_up = store.scores(ids, target), store.scores(ids, target, best_only=True)
-        assert np.argmin(given_up) == np.argmin(whole)
-        assert given_up.min() == whole.min()
+        whole, given_up = store.scores(ids, target), store.scores(ids, target, best=best)
+        lowest = np.argsort(whole, kind="stable")[:best]
+        np.testing.assert_array_equal(np.argsort(given_up, kind="stable")[:best], lowest)
+        np.testing.assert_array_equal(given_up[lowest], whole[lowest])
         assert given_up[0] == whole[0]
         assert (given_up <= whole).all()
-        assert (given_up < whole).any()
+        assert (given_up < whole).any() == (best < 12)
 
 
 def test_a_pose_without_edges_cannot_be_judged() -> None:

@@ -76,20 +76,20 @@ class JointEdgeStore:
         self._edges = self._pairs = self._edges_held = 0
 
     def scores(
-        self, pose_ids: list[int], T_world_link: NDArray[np.float32], limit: float = 0.0, best_only: bool = False
+        self, pose_ids: list[int], T_world_link: NDArray[np.float32], limit: float = 0.0, best: int = 0
     ) -> NDArray[np.float32]:
         """σ (n,) float32 of the poses for links (L, 4, 4), in the order given, up to and with the first one below
         ``limit``: the others are not scored. A pose without edges cannot be judged: its σ is infinite.
 
-        ``best_only``: the lowest σ is right; of others it may be what was added up when it passed the lowest so far,
-        for a sum of lengths only grows.
+        ``best``: so many of the lowest are right; of others σ may be what was added up when it passed those so far, for
+        a sum of lengths only grows. 0: all are.
         """
         runs = [self._runs[pose_id][1] for pose_id in pose_ids]
         pairs = np.array([(run.start, run.stop) for run in runs], np.int64).reshape(-1, 2)
         found = np.empty(len(pairs), np.float32)
         count = _search(
             self._points, self._rest, self._links, self._pair_edges, self._pair_weights, pairs,
-            np.ascontiguousarray(T_world_link, np.float32), np.float32(limit), best_only, found,
+            np.ascontiguousarray(T_world_link, np.float32), np.float32(limit), best, found,
         )  # fmt: skip
         return found[:count]
 
@@ -117,12 +117,12 @@ class JointEdgeStore:
 
 
 @njit(nogil=True, cache=True, error_model="numpy", fastmath={"reassoc", "contract", "nsz"})
-def _search(points, rest, links, pair_edges, pair_weights, pose_pairs, T, limit, best_only, out):  # type: ignore[no-untyped-def]
+def _search(points, rest, links, pair_edges, pair_weights, pose_pairs, T, limit, best, out):  # type: ignore[no-untyped-def]
     """Writes σ of each pose to ``out``; returns how many it scored."""
     R = np.empty((LINK_COUNT, LINK_COUNT, 3, 3), np.float32)
     t = np.empty((LINK_COUNT, LINK_COUNT, 3), np.float32)
     known = np.zeros((LINK_COUNT, LINK_COUNT), np.bool_)
-    lowest = np.float32(np.inf)
+    lowest = np.full(max(best, 1), np.inf, np.float32)  # so far, rising
     for n in range(len(pose_pairs)):
         sigma = np.float32(0.0)
         for p in range(pose_pairs[n, 0], pose_pairs[n, 1]):
@@ -132,10 +132,22 @@ def _search(points, rest, links, pair_edges, pair_weights, pose_pairs, T, limit,
                 seen_from(T, a, b, R[a, b], t[a, b])
             change = length_change(points, rest, pair_edges[p, 0], pair_edges[p, 1], R[a, b], t[a, b])
             sigma += change * pair_weights[p]
-            if best_only and sigma > lowest:
+            if best > 0 and sigma > lowest[best - 1]:
                 break
         out[n] = sigma if pose_pairs[n, 1] > pose_pairs[n, 0] else np.float32(np.inf)
-        lowest = min(lowest, out[n])
+        _insert(lowest, out[n])
         if out[n] < limit:
             return n + 1
     return len(pose_pairs)
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _insert(lowest, value):  # type: ignore[no-untyped-def]
+    """Into a rising row, whose last value falls out."""
+    place = len(lowest) - 1
+    if value >= lowest[place]:
+        return
+    while place > 0 and lowest[place - 1] > value:
+        lowest[place] = lowest[place - 1]
+        place -= 1
+    lowest[place] = value

@@ -121,10 +121,10 @@ class PoseRepository:
         return [entry.mesh.pose_id for entry in whole]
 
     def scores(
-        self, pose_ids: list[int], T_world_link: NDArray[np.float32], limit: float = 0.0, best_only: bool = False
+        self, pose_ids: list[int], T_world_link: NDArray[np.float32], limit: float = 0.0, best: int = 0
     ) -> NDArray[np.float32]:
         """σ of some poses, in their order, up to and with the first one below ``limit``: ``JointEdgeStore.scores``."""
-        return self._edges.scores(pose_ids, T_world_link, limit, best_only)
+        return self._edges.scores(pose_ids, T_world_link, limit, best)
 
     def get(self, pose_id: int) -> RiggedMesh | None:
         """The pose of that id, if it is here."""

@@ -14,7 +14,8 @@ from common.body.skinning import Skinning, animate
 from common.geometry.camera_model import Camera
 from common.geometry.point_splats import render_points
 from common.geometry.rasterizer import render
-from receiver.viewer.viewer import ShownFrame, ViewerStatus, ViewMode
+from receiver.viewer.pose_blending import Picture, blended, shares
+from receiver.viewer.viewer import MovedPose, ShownFrame, ViewerStatus, ViewMode
 
 if TYPE_CHECKING:
     from common.body.rigged_mesh import RiggedMesh
@@ -35,7 +36,8 @@ class OffscreenViewer:
         self._points: LinkPoints | None = None
         self._newest: ShownFrame | None = None
         self._poses: dict[int, RiggedMesh] = {}
-        self._on_screen: tuple[ShownFrame, RiggedMesh] | None = None  # replaced whole, so that threads see both or none
+        # Replaced whole, so that threads see all of it or nothing.
+        self._on_screen: tuple[ShownFrame, RiggedMesh, list[tuple[RiggedMesh, MovedPose]]] | None = None
         self.frames_shown = 0
         self.status = ViewerStatus()
 
@@ -71,7 +73,8 @@ class OffscreenViewer:
         if frame.pose_id is None:
             self._on_screen = None
         elif frame.pose_id in self._poses:
-            self._on_screen = (frame, self._poses[frame.pose_id])
+            others = [(self._poses[other.pose_id], other) for other in frame.others if other.pose_id in self._poses]
+            self._on_screen = (frame, self._poses[frame.pose_id], others)
             self.frames_shown += 1
 
     def set_status(self, status: ViewerStatus) -> None:
@@ -87,12 +90,23 @@ class OffscreenViewer:
             return self._render_points(cameras)
         if (on_screen := self._on_screen) is None:
             return [_nobody(camera) for camera in cameras]
-        frame, mesh = on_screen
+        frame, mesh, others = on_screen
+        pictures = [self._render_first(frame, mesh, cameras)]
+        pictures += [self._render_pose(other, moved.motion, cameras) for other, moved in others]
+        of_each = shares(len(others), frame.live if self._mode == "live" else 0)
+        return [blended(of_one_camera, of_each) for of_one_camera in zip(*pictures, strict=True)]
+
+    def _render_first(self, frame: ShownFrame, mesh: RiggedMesh, cameras: Sequence[Camera]) -> list[Picture]:
+        """The frame's own pose, which may follow maps."""
         assert frame.motion is not None  # as its pose is not
+        if self._mode != "live" or frame.surface is None or frame.links is None:
+            return self._render_pose(mesh, frame.motion, cameras)
         vertices = animate(mesh, frame.motion, self._skinning)
-        if self._mode == "live" and frame.surface is not None and frame.links is not None:
-            moved, offsets = frame.surface.follow(frame.links, mesh.vertex_link, vertices, frame.live)
-            return [render_live(mesh, moved, offsets, camera) for camera in cameras]
+        moved, offsets = frame.surface.follow(frame.links, mesh.vertex_link, vertices, frame.live)
+        return [render_live(mesh, moved, offsets, camera) for camera in cameras]
+
+    def _render_pose(self, mesh: RiggedMesh, motion: NDArray[np.float32], cameras: Sequence[Camera]) -> list[Picture]:
+        vertices = animate(mesh, motion, self._skinning)
         return [render(vertices, mesh.faces_drawn, mesh.mesh.surface, camera, BACKGROUND) for camera in cameras]
 
     def _render_points(self, cameras: Sequence[Camera]) -> list[tuple[NDArray[np.uint8], NDArray[np.float32]]]:

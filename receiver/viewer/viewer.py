@@ -33,12 +33,21 @@ class ConnectionState(StrEnum):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class MovedPose:
+    """A candidate pose and how its links moved since it was captured: ``motion`` (L, 3, 4) float32."""
+
+    pose_id: int
+    motion: NDArray[np.float32]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class ShownFrame:
     """One instant on screen: which candidate pose is drawn and how its links moved since it was captured.
 
     ``capture_ns``: the sender's capture time of the skeleton [ns]. ``pose_id``: the candidate pose drawn; None while
     the repository is empty (then ``motion`` is None too and only the joints are known).
     ``motion`` (L, 3, 4) float32: T_world_link(now) · T_link_world(at capture), moves the mesh's world vertices.
+    ``others``: poses that it is blended with: the picture is the mean of all, but for what is ``live`` of this one.
     ``joints`` (L, 3) float32 [m, world]: link origins. ``sigma``: distortion score σ of the drawn pose (nan: none).
     ``links`` (L, 3, 4) float32: T_world_link, moves points; None where nobody needs it.
     ``surface``: what maps show beyond that mesh, None: nothing; ``live``: how much of it to show, 0..1.
@@ -58,6 +67,7 @@ class ShownFrame:
     joints: NDArray[np.float32]
     sigma: float
     links: NDArray[np.float32] | None = field(default=None, kw_only=True)
+    others: tuple[MovedPose, ...] = field(default=(), kw_only=True)
     surface: LiveSurface | None = field(default=None, kw_only=True)
     live: float = field(default=0.0, kw_only=True)
     region_sigma: NDArray[np.float32] | None = field(default=None, kw_only=True)
@@ -69,6 +79,8 @@ class ShownFrame:
     def __post_init__(self) -> None:
         if (self.pose_id is None) != (self.motion is None):
             raise ValueError("a shown frame has a pose and its motion, or neither")
+        if self.others and self.pose_id is None:
+            raise ValueError("a shown frame has no pose, but others to blend it with")
         if self.surface is not None and self.surface.pose_id != self.pose_id:
             raise ValueError(f"a surface of pose {self.surface.pose_id} in a frame of pose {self.pose_id}")
         if self.motion is not None and self.motion.shape != (LINK_COUNT, 3, 4):

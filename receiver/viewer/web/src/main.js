@@ -13,6 +13,7 @@ const WITHHELD_PRESENCE = 0.6;
 const hud = new Hud();
 const stage = openStage(document.getElementById("stage"));
 const person = new Person(stage.scene);
+person.blends = !stage.modest || new URLSearchParams(location.search).has("blend"); // in software it takes too long
 const points = new Points(stage.scene);
 const skeleton = new SkeletonOverlay(stage.scene);
 
@@ -105,7 +106,7 @@ function draw(now) {
     newest = null;
     drawnAt = now;
   }
-  stage.draw();
+  stage.draw(person);
   hud.tick(now, performance.now() - capturedAt);
 }
 requestAnimationFrame(draw);

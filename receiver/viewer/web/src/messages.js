@@ -1,6 +1,6 @@
 // The page's end of receiver/viewer/page_messages.py: typed arrays read in place, little-endian.
 
-export const VERSION = 6;
+export const VERSION = 7;
 const KINDS = { 1: decodePose, 2: decodeFrame, 3: decodeRemove, 4: decodePoints, 5: decodeLive };
 const NO_POSE = 0xffffffff;
 export const LINKS = 23;
@@ -37,6 +37,10 @@ function decodePose(buffer, view) {
 
 function decodeFrame(buffer, view) {
   const poseId = view.getUint32(4, true);
+  const others = [];
+  for (let at = 24 + LINKS * 108 + align(LINKS); at < buffer.byteLength; at += 4 + LINKS * 48) {
+    others.push({ poseId: view.getUint32(at, true), motion: new Float32Array(buffer, at + 4, LINKS * 12) });
+  }
   return {
     kind: "frame",
     poseId: poseId === NO_POSE ? null : poseId,
@@ -47,6 +51,7 @@ function decodeFrame(buffer, view) {
     joints: new Float32Array(buffer, 24 + LINKS * 48, LINKS * 3),
     links: new Float32Array(buffer, 24 + LINKS * 60, LINKS * 12),
     confidence: new Uint8Array(buffer, 24 + LINKS * 108, LINKS),
+    others, // what it is blended with
   };
 }
 

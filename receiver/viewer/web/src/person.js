@@ -1,10 +1,12 @@
 // The person: each candidate pose's mesh and texture are on the GPU once; a frame moves it by one rigid motion per link,
 // mixed at the joints as common/body/skinning.py does. Where it is to follow newer maps, live.js moves and tints it.
+// A frame may name several poses, whose mean blending.js draws.
 
 import * as THREE from "three";
 import { followingShader, LiveSurface } from "./live.js";
 import { LINKS } from "./messages.js";
 
+const NOT_LIVE = { value: 0 };
 const SKINNINGS = ["rigid", "linear", "spherical"];
 
 const vertexShader = /* glsl */ `
@@ -44,6 +46,7 @@ ${followingShader}
 const fragmentShader = /* glsl */ `
   uniform sampler2D atlas;
   uniform float presence;
+  uniform float share;  // of the picture
   in vec2 at;
   in vec3 tint;
   out vec4 colour;
@@ -51,7 +54,7 @@ const fragmentShader = /* glsl */ `
   void main() {
     vec3 shade = clamp(texture(atlas, at).rgb + tint, 0.0, 1.0);
     vec3 faded = mix(vec3(dot(shade, vec3(0.3, 0.59, 0.11)) * 0.45), shade, presence);
-    colour = vec4(faded, 1.0);
+    colour = vec4(share * faded, share);
   }`;
 
 export class Person {
@@ -61,13 +64,9 @@ export class Person {
     this.meshes = new Map(); // of all poses; those in the group can be shown
     this.frame = null; // the last one to show
     this.live = new LiveSurface();
-    this.shared = {
-      ...this.live.uniforms,
-      skinning: { value: 0 },
-      motion: { value: new Float32Array(12 * LINKS) },
-      turn: { value: Array.from({ length: LINKS }, () => new THREE.Quaternion()) },
-      presence: { value: 1 },
-    };
+    this.shown = []; // the meshes on screen, the best pose's first
+    this.blends = true; // several, where a frame names several; else the best one alone
+    this.shared = { ...this.live.uniforms, skinning: { value: 0 }, presence: { value: 1 } };
   }
 
   /** The pose can be shown when its texture is decoded; by then it may have been removed. */
@@ -87,6 +86,7 @@ export class Person {
     const mesh = this.meshes.get(poseId);
     if (!mesh) return;
     this.meshes.delete(poseId);
+    this.shown = this.shown.filter((other) => other !== mesh);
     this.group.remove(mesh);
     mesh.geometry.dispose();
     mesh.material.uniforms.atlas.value?.dispose();
@@ -96,18 +96,32 @@ export class Person {
   clear() {
     for (const poseId of [...this.meshes.keys()]) this.remove(poseId);
     this.frame = null;
+    this.shown = [];
     this.live.clear();
   }
 
-  /** Shows the frame's pose, nobody if it has none; while its mesh is not ready yet the last one stays as it was. */
+  /** Shows the frame's poses, nobody if it has none; while its first one is not ready yet the last stays as it was. */
   show(frame) {
-    const { poseId, motion } = frame;
+    const { poseId, others } = frame;
     this.frame = frame;
     if (poseId !== null && !this.meshes.get(poseId)?.parent) return;
-    this.shared.motion.value.set(motion);
-    this.shared.turn.value.forEach((turn, link) => turn.setFromRotationMatrix(matrixOf(motion, link)));
     this.live.show(frame);
-    for (const [id, mesh] of this.meshes) mesh.visible = id === poseId;
+    const moved = poseId === null ? [] : [frame, ...(this.blends ? others : [])];
+    const ready = moved.filter((pose) => this.meshes.get(pose.poseId)?.parent);
+    const ofOthers = (1 - this.live.uniforms.live.value) / ready.length; // as receiver/viewer/pose_blending.py
+    for (const mesh of this.meshes.values()) mesh.visible = false;
+    this.shown = ready.map((pose, n) => this.move(pose, n ? ofOthers : 1 - (ready.length - 1) * ofOthers));
+  }
+
+  move({ poseId, motion }, share) {
+    const mesh = this.meshes.get(poseId);
+    const uniforms = mesh.material.uniforms;
+    uniforms.motion.value.set(motion);
+    uniforms.turn.value.forEach((turn, link) => turn.setFromRotationMatrix(matrixOf(motion, link)));
+    uniforms.share.value = share;
+    uniforms.live = poseId === this.frame.poseId ? this.live.uniforms.live : NOT_LIVE;
+    mesh.visible = true;
+    return mesh;
   }
 
   set visible(value) {
@@ -139,6 +153,9 @@ function meshOf({ boxMin, boxSize, positions, uv, skin, joints, indices }, share
     fragmentShader,
     uniforms: {
       ...shared,
+      motion: { value: new Float32Array(12 * LINKS) },
+      turn: { value: Array.from({ length: LINKS }, () => new THREE.Quaternion()) },
+      share: { value: 1 },
       atlas: { value: null },
       boxMin: { value: new THREE.Vector3(...boxMin) },
       boxSize: { value: new THREE.Vector3(...boxSize) },

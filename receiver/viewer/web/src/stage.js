@@ -2,6 +2,7 @@
 
 import * as THREE from "three";
 import { OrbitControls } from "three/addons/controls/OrbitControls.js";
+import { Blending } from "./blending.js";
 
 const EYE_HEIGHT_M = 0.95; // the middle of a standing person
 const SEEN_HEIGHT_M = 2.5;
@@ -11,10 +12,11 @@ const FOLLOW_S = 0.8;
 
 export class Stage {
   constructor(canvas) {
-    const modest = drawsInSoftware();
-    this.renderer = new THREE.WebGLRenderer({ canvas, antialias: !modest, alpha: true });
-    this.renderer.setPixelRatio(modest ? 1 : Math.min(devicePixelRatio, 2));
+    this.modest = drawsInSoftware();
+    this.renderer = new THREE.WebGLRenderer({ canvas, antialias: !this.modest, alpha: true });
+    this.renderer.setPixelRatio(this.modest ? 1 : Math.min(devicePixelRatio, 2));
     this.scene = new THREE.Scene();
+    this.blending = new Blending(this.renderer, this.scene, !this.modest);
     this.scene.add(floor());
     this.shadow = softShadow();
     this.scene.add(this.shadow);
@@ -63,9 +65,15 @@ export class Stage {
     this.changed = true;
   }
 
-  draw() {
+  /** The room, and in it the person as one mesh, or as the mean of several. */
+  draw(person) {
     if (!this.changed) return;
     this.changed = false;
+    const blended = person.group.visible && person.shown.length > 1;
+    for (const mesh of person.shown) mesh.visible = true;
+    if (blended) this.blending.draw(person.shown, this.camera);
+    for (const mesh of person.shown) mesh.visible = !blended; // in the scene
+    this.blending.visible = blended;
     this.renderer.render(this.scene, this.camera);
   }
 }
