@@ -30,6 +30,7 @@ class CapturedFrame:
 
 
 Posed = tuple[Skeleton, SkeletonPose, float] | None
+_ROW = 7  # frame, camera, corner, size, whether complete
 _PARTS = ("offsets", "tips", "radii", "root_position", "rotations", "confidence")
 
 
@@ -38,9 +39,9 @@ def save_frames(folder: Path, frames: Sequence[CapturedFrame], cameras: Sequence
     folder.mkdir(parents=True, exist_ok=True)
     index = {camera.name: number for number, camera in enumerate(cameras)}
     views = [(k, view) for k, frame in enumerate(frames) for view in frame.views]
-    rows = [(k, index[view.camera.name], view.u0, view.v0, *view.depth_mm.shape) for k, view in views]
+    rows = [(k, index[view.camera.name], view.u0, view.v0, *view.depth_mm.shape, view.complete) for k, view in views]
     arrays = {
-        "view_rows": np.array(rows, np.int64).reshape(-1, 6),
+        "view_rows": np.array(rows, np.int64).reshape(-1, _ROW),
         "depth_mm": np.concatenate([view.depth_mm.ravel() for _, view in views]),
         "colour": np.concatenate([view.colour.reshape(-1, 3) for _, view in views]),
         **_pose_arrays("true", [(*frame.true, 1.0) for frame in frames]),
@@ -55,15 +56,18 @@ def load_frames(folder: Path, cameras: Sequence[Camera]) -> list[CapturedFrame] 
     """The frames ``save_frames`` wrote, their pixels mapped, not read; None where there are none."""
     if not (folder / "time_s.npy").is_file():
         return None
+    rows = np.load(folder / "view_rows.npy")
+    if rows.shape[1] != _ROW:  # of an earlier version
+        return None
     time_s = np.load(folder / "time_s.npy")
     depth, colour = (np.load(folder / f"{name}.npy", mmap_mode="r") for name in ("depth_mm", "colour"))
     views: list[list[View]] = [[] for _ in time_s]
     first = 0
-    for k, camera, u0, v0, height, width in np.load(folder / "view_rows.npy").tolist():
+    for k, camera, u0, v0, height, width, complete in rows.tolist():
         pixels = slice(first, first := first + height * width)
         shape = height, width
-        view = View(cameras[camera], u0, v0, depth[pixels].reshape(shape), colour[pixels].reshape(*shape, 3))
-        views[k].append(view)
+        images = depth[pixels].reshape(shape), colour[pixels].reshape(*shape, 3)
+        views[k].append(View(cameras[camera], u0, v0, *images, complete=bool(complete)))
     true, own = _poses(folder, "true"), _poses(folder, "own")
     frames = []
     for second, seen, posed, found in zip(time_s.tolist(), views, true, own, strict=True):

@@ -13,7 +13,6 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from common.body.view import View
 from common.geometry.rasterizer import render
 from scripts.capture_files import CapturedFrame, load_frames, save_frames
 from scripts.fidelity import Picture, centres, finer, measuring_cameras, smooth
@@ -26,6 +25,7 @@ from sender.capture.rig_process import RigRenderer
 from sender.fitting.open_tracker import open_tracker
 from sender.reconstruction.background import BackgroundModel
 from sender.reconstruction.foreground_points import PointSampler
+from sender.reconstruction.outline import completed
 
 FRAME_RATE_HZ = 30
 FRAME_NS = round(1e9 / FRAME_RATE_HZ)
@@ -128,10 +128,12 @@ def _captured(
             renderer.view(index, time_s, depth, colour)
             view = rooms[index].foreground(DepthFrame(index, k, k * FRAME_NS, depth, colour))
             if view is not None:
-                views.append(View(view.camera, view.u0, view.v0, view.depth_mm.copy(), view.colour.copy()))
+                views.append(view)
         fit = tracker.track(sampler.points(views), k * FRAME_NS)
         own = None if fit is None else (fit.skeleton, fit.pose, fit.confidence)
-        frames.append(CapturedFrame(time_s, tuple(views), (truth.skeleton, truth.pose(time_s)), own))
+        frames.append(
+            CapturedFrame(time_s, tuple(completed(view) for view in views), (truth.skeleton, truth.pose(time_s)), own)
+        )
         if k % FRAME_RATE_HZ == 0:
             progress(k / count)
     return frames

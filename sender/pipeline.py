@@ -33,6 +33,7 @@ from sender.fitting.outside_tracker import OutsideTracker
 from sender.fitting.start_joints import skeleton_from_joints
 from sender.fitting.tracker import MINIMUM_POINTS, FitResult, Tracker
 from sender.reconstruction.depth_fusion import DepthFusion, PosedViews
+from sender.reconstruction.outline import completed
 from sender.reconstruction.person_points import Reconstruction
 
 FINE_BYTES = 80_000  # of a pose sent finely, before one was
@@ -263,12 +264,13 @@ class CandidatePath:
         return encoded
 
     def _fused(self, tracked: TrackedFrame) -> tuple[View, ...]:
-        """The frame's views, their depth averaged with the last frames'."""
+        """The frame's views, their outlines completed by colour and their depth averaged with the last frames'."""
         while self._seen:
             self._fusion.remember(self._seen.popleft())
         assert tracked.skeleton is not None
         assert tracked.T_world_link is not None
-        posed = PosedViews(tracked.capture_ns, tracked.views, tracked.T_world_link)
+        views = tuple(completed(view) for view in tracked.views)
+        posed = PosedViews(tracked.capture_ns, views, tracked.T_world_link)
         return self._fusion.fused(posed, tracked.skeleton)
 
     def _candidate(self, tracked: TrackedFrame, views: tuple[View, ...]) -> CandidatePose:

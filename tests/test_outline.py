@@ -11,7 +11,7 @@ from common.geometry.camera_model import Camera
 from common.geometry.rasterizer import render
 from sender.capture.frame_set import DepthFrame
 from sender.reconstruction.background import BackgroundModel
-from sender.reconstruction.outline import MARGIN, REACH, STRIPES
+from sender.reconstruction.outline import MARGIN, REACH, STRIPES, completed
 from tests.rig_scene import frame_set, renderer
 
 W, H = 200, 150
@@ -40,8 +40,7 @@ def _model(room_colour: Image | None) -> BackgroundModel:
     return BackgroundModel(CAMERA, np.full((H, W), ROOM_MM, np.uint16), room_colour=room_colour)
 
 
-def _whole(view: View | None) -> NDArray[np.uint16]:
-    assert view is not None
+def _whole(view: View) -> NDArray[np.uint16]:
     whole = np.zeros((H, W), np.uint16)
     h, w = view.depth_mm.shape
     whole[view.v0 : view.v0 + h, view.u0 : view.u0 + w] = view.depth_mm
@@ -51,7 +50,7 @@ def _whole(view: View | None) -> NDArray[np.uint16]:
 def _foreground(model: BackgroundModel, depth: NDArray[np.uint16], colour: Image) -> View:
     view = model.foreground(DepthFrame(0, 0, 0, depth, colour))
     assert view is not None
-    return view
+    return completed(view)
 
 
 def _box_at(value: int, box: tuple[slice, slice] = BOX) -> NDArray[np.uint16]:
@@ -66,10 +65,21 @@ def test_a_rim_that_depth_lost_is_the_person_again_to_the_pixel() -> None:
     np.testing.assert_array_equal(_whole(view), _box_at(PERSON_MM))
 
 
+def test_what_the_tracker_sees_is_left_as_depth_has_it() -> None:
+    depth, colour = _seen(missed=3)
+    view = _model(_room()).foreground(DepthFrame(0, 0, 0, depth, colour))
+    assert view is not None
+    assert not view.complete
+    before = view.depth_mm.copy()
+    assert np.count_nonzero(completed(view).depth_mm) > np.count_nonzero(before)
+    np.testing.assert_array_equal(view.depth_mm, before)
+
+
 def test_without_colour_the_rim_stays_lost() -> None:
     depth, _ = _seen(missed=3)
-    view = _model(_room()).foreground(DepthFrame(0, 0, 0, depth, None))
-    assert view is not None
+    seen = _model(_room()).foreground(DepthFrame(0, 0, 0, depth, None))
+    assert seen is not None
+    view = completed(seen)
     assert not view.complete
     assert np.count_nonzero(view.depth_mm) == (70 - 6) * (50 - 6)
 
@@ -129,9 +139,8 @@ def test_where_the_light_has_changed_colour_says_nothing() -> None:
 def test_an_unknown_room_is_learned_beside_the_person_and_used_where_it_is_known() -> None:
     model = _model(None)
     depth, colour = _seen(missed=2)
-    view = None
     for _ in range(2 * STRIPES):
-        view = model.foreground(DepthFrame(0, 0, 0, depth, colour))
+        view = _foreground(model, depth, colour)
     assert np.count_nonzero(_whole(view)) == (70 - 4) * (50 - 4)  # nothing is known around the person yet
     elsewhere = (BOX[0], slice(BOX[1].start - MARGIN - 60 + 20, BOX[1].stop - MARGIN - 60 + 20))
     whole = _whole(_foreground(model, *_seen(2, elsewhere)))
@@ -142,8 +151,8 @@ def test_an_unknown_room_is_learned_beside_the_person_and_used_where_it_is_known
 def test_soles_are_not_learned_as_the_floor_however_long_somebody_stands_still() -> None:
     model = _model(_room())
     depth, colour = _seen(missed=3)
-    for _ in range(100 * STRIPES):
-        view = model.foreground(DepthFrame(0, 0, 0, depth, colour))
+    for _ in range(50 * STRIPES):
+        view = _foreground(model, depth, colour)
     np.testing.assert_array_equal(_whole(view), _box_at(PERSON_MM))
 
 
@@ -162,8 +171,9 @@ def test_the_rig_s_person_is_cut_out_almost_as_the_truth_has_it() -> None:
         for coloured in (True, False):
             model = BackgroundModel(camera, rig.empty_room(index), room_colour=rig.empty_room_colour(index))
             given = frame if coloured else DepthFrame(index, 0, 0, frame.depth_mm, None)
-            view = model.foreground(given)
-            assert view is not None
+            seen = model.foreground(given)
+            assert seen is not None
+            view = completed(seen)
             h, w = view.depth_mm.shape
             person = np.zeros(true.shape, bool)
             person[view.v0 : view.v0 + h, view.u0 : view.u0 + w] = view.depth_mm > 0

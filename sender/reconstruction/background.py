@@ -2,7 +2,8 @@
 
 A modified Gaussian average (Lien 2009 §6.1; Piccardi 2004): mean and variance of the empty room per pixel, updated
 slowly and only where the background shows. A person stands in front of the room, so a pixel is foreground when it is
-nearer than the mean by more than k σ, never when it is farther. Cameras with colour complete the outline by it.
+nearer than the mean by more than k σ, never when it is farther. Of cameras with colour the outline can be completed
+(``outline``).
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from numpy.typing import NDArray
 from common.body.view import View
 from common.geometry.camera_model import Camera
 from sender.capture.frame_set import DepthFrame
-from sender.reconstruction.outline import REACH, RoomColour
+from sender.reconstruction.outline import REACH, RoomColour, SeenView
 
 UPDATE_STRIPES = 8  # a frame updates every eighth row: the model is slow anyway, and this keeps it cheap
 
@@ -201,8 +202,9 @@ class BackgroundModel:
         colour = np.ascontiguousarray(frame.colour[v0 : v0 + h, u0 : u0 + w])
         if self._room_colour is None or not self._room_colour.steady:
             return View(camera, u0, v0, person, colour)
-        completed = self._room_colour.completed(person, depth, frame.colour, box, s.range_limit_mm / 1000)
-        return View(camera, u0, v0, completed, colour, complete=True)
+        readings, room = depth[v0 : v0 + h, u0 : u0 + w], self._room_colour.around(box)
+        limit = s.range_limit_mm / 1000
+        return SeenView(camera, u0, v0, person, colour, readings_mm=readings, room=room, range_limit=limit)
 
     def _components(
         self, mask: NDArray[np.uint8]

@@ -3,23 +3,49 @@
 A depth sensor loses readings at edges, and near the floor its noise hides a shoe. Where a pixel that touches the
 person looks like the person and not like the empty room, it is the person's too: with its own reading where that lies
 on the surface beside it, else with that surface's depth. So the outline grows pixel by pixel, ``REACH`` at most.
+
+Candidate poses are worth the time this takes; the tracker, which goes by some points of each frame, does not need it.
 """
 
 from __future__ import annotations
+
+from dataclasses import dataclass, field
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from common.body.view import View
+
 REACH = 5  # pixels that depth misses at most: a sole on the floor, a few lost readings at an edge
 NOISE = 24.0  # levels: colours this alike may be the same, by a sensor's noise or a soft shadow
 MIXED = 0.5  # a pixel is the person's if it shows more of the person than of the room
-STRIPES = 8  # a frame updates every eighth row, as the background's depth
+STRIPES = 32  # a frame updates every 32nd row: all in a second
 LEARNING_RATE = 0.05  # weight of one picture in the mean
 MARGIN = 24  # pixels around the person that are not learned: shadows, soles, blur
 CHANGED_SHARE = 0.1  # of the room beside the person; with more, the light or the exposure is another
 
 Box = tuple[int, int, int, int]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SeenView(View):
+    """A view and what else its pixels showed: ``readings_mm`` (h, w) uint16 [mm], all of them; ``room`` (h, w, 3)
+    float32, the empty room's colour, nan where it is not known. ``range_limit``: share of its depth that a reading may
+    be off the surface beside it."""
+
+    readings_mm: NDArray[np.uint16] = field(kw_only=True)
+    room: NDArray[np.float32] = field(kw_only=True)
+    range_limit: float = field(kw_only=True)
+
+
+def completed(view: View) -> View:
+    """The view with what its outline lacked, where colour can tell; else as it is."""
+    if not isinstance(view, SeenView):
+        return view
+    depth_mm = view.depth_mm.copy()
+    _grow(depth_mm, view.readings_mm, view.colour, view.room, np.float32(view.range_limit))
+    return View(view.camera, view.u0, view.v0, depth_mm, view.colour, complete=True)
 
 
 class RoomColour:
@@ -40,24 +66,10 @@ class RoomColour:
         self.steady = bool(changed <= CHANGED_SHARE * known)
         self._row = (self._row + 1) % STRIPES
 
-    def completed(
-        self,
-        person_mm: NDArray[np.uint16],
-        depth_mm: NDArray[np.uint16],
-        colour: NDArray[np.uint8],
-        box: Box,
-        range_limit: float,
-    ) -> NDArray[np.uint16]:
-        """The person's depth (h, w) uint16 [mm] in ``box``, 0 = not the person, with what its outline lacked.
-
-        ``person_mm`` (h, w): as depth has it; ``depth_mm`` (H, W), ``colour`` (H, W, 3): all that was seen.
-        ``range_limit``: share of its depth that a reading may be off the surface beside it.
-        """
+    def around(self, box: Box) -> NDArray[np.float32]:
+        """What is known of it in ``box`` (h, w, 3): nan where nothing is. It goes on to follow the room."""
         u0, v0, w, h = box
-        cut = slice(v0, v0 + h), slice(u0, u0 + w)
-        out = person_mm.copy()
-        _grow(out, depth_mm[cut], colour[cut], self._mean[cut], np.float32(range_limit))
-        return out
+        return self._mean[v0 : v0 + h, u0 : u0 + w]
 
 
 @njit(nogil=True, cache=True, error_model="numpy")

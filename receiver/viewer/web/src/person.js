@@ -79,7 +79,7 @@ export class Person {
     if (this.meshes.get(poseId) !== mesh) return picture.close();
     mesh.material.uniforms.atlas.value = textureOf(picture);
     this.group.add(mesh);
-    if (this.frame?.poseId === poseId) this.show(this.frame);
+    if (this.frame && [this.frame, ...this.frame.others].some((pose) => pose.poseId === poseId)) this.show(this.frame);
   }
 
   remove(poseId) {
