@@ -19,7 +19,7 @@ from receiver.viewer.page_messages import (
     encode_status,
 )
 from receiver.viewer.page_view import PageView
-from receiver.viewer.viewer import ConnectionState, ViewerStatus
+from receiver.viewer.viewer import ConnectionState, MovedPose, ViewerStatus
 from tests.capsule_person import capsule_person, shown_frame
 
 PERSON = capsule_person(pose_id=7)
@@ -79,6 +79,20 @@ def test_a_withheld_frame_is_told() -> None:
         view = view_of(POSE, encode_frame(dataclasses.replace(frame, withheld=withheld)))
         assert view.person is not None
         assert view.person.frame.withheld == withheld
+
+
+def test_of_blended_poses_the_first_is_shown() -> None:
+    frame = shown_frame(PERSON, 1.3, 90)
+    assert frame.motion is not None
+    others = (MovedPose(8, 2 * frame.motion), MovedPose(9, 3 * frame.motion))
+    message = encode_frame(dataclasses.replace(frame, others=others))
+    view, alone = view_of(POSE, message), view_of(POSE, FRAME)
+    assert view.person is not None
+    assert alone.person is not None
+    np.testing.assert_array_equal(view.person.vertices(), alone.person.vertices())
+    for wrong in (message[:-1], message + b"\0", FRAME[:-4]):
+        with pytest.raises(ValueError, match="for each other pose"):
+            PageView().take(wrong)
 
 
 def test_the_picture_is_live_while_the_receiver_receives() -> None:

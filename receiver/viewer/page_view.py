@@ -155,14 +155,14 @@ class PageView:
 
 
 def decode_frame(message: bytes) -> PageFrame:
-    """A FRAME message.
+    """A FRAME message; of the poses that it blends, the first.
 
     Raises:
         ValueError: of another size, or numbers that are not finite.
     """
-    size = 24 + 108 * LINK_COUNT + _padded(LINK_COUNT)
-    if len(message) != size:
-        raise ValueError(f"frame: {len(message)} bytes, expected {size}")
+    size, of_another = 24 + 108 * LINK_COUNT + _padded(LINK_COUNT), 4 + 48 * LINK_COUNT
+    if len(message) < size or (len(message) - size) % of_another:
+        raise ValueError(f"frame: {len(message)} bytes, expected {size} and {of_another} for each other pose")
     pose_id, sequence = struct.unpack_from("<II", message, 4)
     motion = np.frombuffer(message, "<f4", 12 * LINK_COUNT, 24).reshape(-1, 3, 4)
     joints = np.frombuffer(message, "<f4", 3 * LINK_COUNT, 24 + 48 * LINK_COUNT).reshape(-1, 3)
