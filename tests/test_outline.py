@@ -142,6 +142,7 @@ def test_an_unknown_room_is_learned_beside_the_person_and_used_where_it_is_known
     for _ in range(2 * STRIPES):
         view = _foreground(model, depth, colour)
     assert np.count_nonzero(_whole(view)) == (70 - 4) * (50 - 4)  # nothing is known around the person yet
+    assert not view.complete
     elsewhere = (BOX[0], slice(BOX[1].start - MARGIN - 60 + 20, BOX[1].stop - MARGIN - 60 + 20))
     whole = _whole(_foreground(model, *_seen(2, elsewhere)))
     left = slice(elsewhere[1].start, elsewhere[1].start + 2)

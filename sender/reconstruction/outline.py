@@ -45,7 +45,8 @@ def completed(view: View) -> View:
         return view
     depth_mm = view.depth_mm.copy()
     _grow(depth_mm, view.readings_mm, view.colour, view.room, np.float32(view.range_limit))
-    return View(view.camera, view.u0, view.v0, depth_mm, view.colour, complete=True)
+    known = bool(np.isfinite(view.room).all())  # else what is missing there cannot be told
+    return View(view.camera, view.u0, view.v0, depth_mm, view.colour, complete=known)
 
 
 class RoomColour:
