@@ -38,12 +38,12 @@ _MEMORY = 0.1  # weight of the newest frame in the factor
 class ResidualSettings:
     """``points``: of a frame, what the full grids are sized for; ``reference``: what differences are taken from;
     ``key_interval_s``: the first frame so long after a key is one, which at 20 fps or more is within a second;
-    ``radius_coding``: "zstd" or "png"."""
+    ``radius_coding``: "huffman" or "png"."""
 
     points: int = 10_000
     reference: Literal["model", "previous"] = "model"
     key_interval_s: float = 0.95
-    radius_coding: str = "zstd"
+    radius_coding: str = "huffman"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -138,7 +138,7 @@ class ResidualEncoder:
         return data
 
 
-def quality_at(level: float, radius_coding: str = "zstd") -> MapQuality:
+def quality_at(level: float, radius_coding: str = "huffman") -> MapQuality:
     """How finely maps are coded at a level [%]."""
     jpeg = round(_JPEG_LOW + (_JPEG_HIGH - _JPEG_LOW) * level / LEVEL_MAX)
     return MapQuality(jpeg, _RADIUS_STEPS, radius_coding)

@@ -36,7 +36,7 @@ SECTIONS = encode_maps(LAYOUT, MAPS, FINE)
 REFERENCE = reference_of(decode_maps(LAYOUT, SECTIONS, FINE))
 
 
-@pytest.mark.parametrize("coding", ["zstd", "png"])
+@pytest.mark.parametrize("coding", ["huffman", "png"])
 @pytest.mark.parametrize("reference", [None, REFERENCE], ids=["whole", "difference"])
 @pytest.mark.parametrize("steps", [1, 2, 3, 16])
 def test_occupancy_is_exact_and_radii_are_off_by_half_a_step(
@@ -98,6 +98,11 @@ def bomb(size: int) -> bytes:
     return bytes(zstandard.ZstdCompressor().compress(bytes(size)))
 
 
+def deflated(data: bytes) -> bytes:
+    coder = zlib.compressobj(wbits=-zlib.MAX_WBITS)
+    return coder.compress(data) + coder.flush()
+
+
 def png(width: int, height: int, extra: bytes = b"") -> bytes:
     def chunk(kind: bytes, body: bytes) -> bytes:
         return struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
@@ -116,7 +121,7 @@ EVERY_CELL = zstandard.ZstdCompressor().compress(b"\xff" * (LAYOUT.height * LAYO
         (replaced(occupancy=bomb(1 << 30)), "declares 1073741824 bytes"),
         (replaced(occupancy=b""), "occupancy"),
         (replaced(occupancy=EVERY_CELL), "belong to no link"),
-        (replaced(radius=bomb(1 << 30)), "declares 1073741824 bytes"),
+        (replaced(radius=deflated(bytes(1 << 26))), "not exactly"),
         (replaced(radius=SECTIONS.radius[:-3]), "radius"),
         (replaced(radius=SECTIONS.radius + b"more"), "radius"),
         (replaced(colour=SECTIONS.colour + b"\xff\xd9\xff\xd8"), "a marker within the scan"),
@@ -153,7 +158,7 @@ def test_only_a_plain_png_of_the_right_size_is_decoded(radius: bytes, reason: st
     section=st.sampled_from(["occupancy", "radius", "colour"]),
     at=st.integers(0, 10_000),
     garbage=st.binary(max_size=40),
-    coding=st.sampled_from(["zstd", "png"]),
+    coding=st.sampled_from(["huffman", "png"]),
 )
 def test_garbage_in_a_section_gives_maps_of_the_right_size_or_one_error(
     section: str, at: int, garbage: bytes, coding: str

@@ -179,8 +179,8 @@ def test_a_packet_for_more_points_than_allowed_is_refused() -> None:
 
 def test_the_level_follows_a_budget_of_bytes() -> None:
     ours, control = encoder(), LevelControl()
-    budget_bytes, sizes = 1800.0, []
-    for k in range(40):
+    budget_bytes, sizes = 1500.0, []
+    for k in range(60):
         packet = ours.encode(frame(k), control.level(budget_bytes))
         assert packet is not None
         control.coded(decode_residual_header(packet).level, len(packet))

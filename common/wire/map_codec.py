@@ -1,9 +1,10 @@
 """One frame's link maps in three sections of bytes: which cells are full, their radii, their colours.
 
 Occupancy: a bit a cell, zstd. Radius: rounded to a step, what its neighbours to the left and above let expect taken off
-(the median of left, above and left + above - corner), full cells only, zstd; or a PNG of the rounded map. Colour: JPEG
-with chroma at half resolution, without its header, which is the same for all pictures of one size and quality and is
-600 bytes of a few thousand; empty cells hold the mean of the full ones in their 8 × 8 block, so nothing rings.
+(the median of left, above and left + above - corner), full cells only, in deflate's Huffman code without its matches,
+which in noise are none: zstd, which looks for them, takes a third more. Or a PNG of the rounded map. Colour: JPEG with
+chroma at half resolution, without its header, which is the same for all pictures of one size and quality and is 600
+bytes of a few thousand; empty cells hold the mean of the full ones in their 8 × 8 block, so nothing rings.
 
 Radius decides: sensors' noise is white, so a transform saves nothing on it, and a silhouette shows every millimetre;
 colours a third as good cost 0.1 dB. Against a reference colours are differences, coded in the same way; radii are too
@@ -12,6 +13,7 @@ where that is shorter, which it seldom is: the reference has noise of its own.
 
 from __future__ import annotations
 
+import zlib
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -26,7 +28,7 @@ from common.body.map_layout import BLOCK, MapLayout
 from common.wire.header import WireError
 
 RADIUS_STEPS_MAX = 16  # of 2 mm
-RADIUS_CODINGS = ("zstd", "png")
+RADIUS_CODINGS = ("huffman", "png")
 
 _ZSTD_LEVEL = 3  # higher levels gain a hundredth
 _START_OF_SCAN, _END = b"\xff\xda", b"\xff\xd9"
@@ -37,11 +39,11 @@ _PNG_START, _PNG_CHUNKS = b"\x89PNG\r\n\x1a\n", {b"IHDR", b"IDAT", b"IEND"}
 @dataclass(frozen=True, slots=True)
 class MapQuality:
     """``jpeg`` 1..100 of the colours; ``radius_steps`` 1..16: radii are rounded to so many times 2 mm;
-    ``radius_coding``: "zstd" or "png"."""
+    ``radius_coding``: "huffman" or "png"."""
 
     jpeg: int
     radius_steps: int
-    radius_coding: str = "zstd"
+    radius_coding: str = "huffman"
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,7 +116,8 @@ def _encode_radius(layout: MapLayout, maps: LinkMaps, quality: MapQuality, refer
         return bytes(cv2.imencode(".png", rounded)[1].tobytes())
     unexpected = np.empty(int(np.count_nonzero(maps.full)), np.uint8)
     _take_off(layout.places, maps.full, rounded, unexpected)
-    return zstandard.ZstdCompressor(level=_ZSTD_LEVEL).compress(unexpected.tobytes())
+    coder = zlib.compressobj(wbits=-zlib.MAX_WBITS, strategy=zlib.Z_HUFFMAN_ONLY)
+    return coder.compress(unexpected.tobytes()) + coder.flush()
 
 
 def _decode_radius(
@@ -124,7 +127,7 @@ def _decode_radius(
     if quality.radius_coding == "png":
         rounded = _decode_png(data, *full.shape)
     else:
-        unexpected = np.frombuffer(_decompressed("radius", data, int(np.count_nonzero(full))), np.uint8)
+        unexpected = np.frombuffer(_inflated(data, int(np.count_nonzero(full))), np.uint8)
         rounded = np.zeros(full.shape, np.uint8)
         _put_back(layout.places, full, unexpected, rounded)
     if reference is not None:
@@ -153,6 +156,18 @@ def _decompressed(section: str, data: bytes, size: int) -> bytes:
     if len(out) != size:
         raise WireError(f"{section}: {len(out)} bytes, expected {size}")
     return bytes(out)
+
+
+def _inflated(data: bytes, size: int) -> bytes:
+    """``size`` bytes of a raw deflate stream; no more than that is ever allocated."""
+    decoder = zlib.decompressobj(wbits=-zlib.MAX_WBITS)
+    try:
+        out = decoder.decompress(data, size + 1)
+    except zlib.error as error:
+        raise WireError(f"radius: {error}") from error
+    if len(out) != size or not decoder.eof or decoder.unused_data:
+        raise WireError(f"radius: not exactly {size} bytes")
+    return out
 
 
 def _decode_png(data: bytes, height: int, width: int) -> NDArray[np.uint8]:
