@@ -5,8 +5,9 @@ from __future__ import annotations
 import asyncio
 import logging
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from itertools import pairwise
 
 from common.body.skeleton import Skeleton
 from common.wire.header import WireError
@@ -20,7 +21,8 @@ WAITING = 8
 
 class MapMaker:
     """``bodies(epoch)``: sizes by revision; ``wants_points()``: whether somebody is shown points; ``show``: called on
-    the loop with the newest maps. ``made``: how many packets became maps; ``counts``: those that did not, by cause."""
+    the loop with the newest maps, or one after another with those of a group until there are newer ones. ``made``: how
+    many packets became maps; ``counts``: those that did not, by cause."""
 
     def __init__(
         self,
@@ -37,6 +39,7 @@ class MapMaker:
         self._counts: Counter[str] = Counter()
         self._packets: asyncio.Queue[bytes] = asyncio.Queue(WAITING)
         self._thread = ThreadPoolExecutor(1, "maps")
+        self._playing: asyncio.Task[None] | None = None
 
     @property
     def counts(self) -> Counter[str]:
@@ -63,15 +66,30 @@ class MapMaker:
     async def _make(self, packet: bytes) -> None:
         loop = asyncio.get_running_loop()
         try:
-            maps = await loop.run_in_executor(self._thread, self._path.take, packet, self._bodies, self._wants_points())
+            found = await loop.run_in_executor(
+                self._thread, self._path.take, packet, self._bodies, self._wants_points()
+            )
         except WireError as error:
             self._counts["refused"] += 1
             log.warning("a residual packet is refused: %s", error)
             return
-        if maps is not None:
+        if found:
             self.made += 1
-            self._show(maps)
+            self._stop_playing()
+            self._show(found[0])
+            self._playing = asyncio.create_task(self._play(found)) if len(found) > 1 else None
+
+    async def _play(self, group: Sequence[NewMaps]) -> None:
+        """All but the first of a group's maps, at the pace at which they were captured."""
+        for before, new in pairwise(group):
+            await asyncio.sleep((new.maps.header.capture_ns - before.maps.header.capture_ns) / 1e9)
+            self._show(new)
+
+    def _stop_playing(self) -> None:
+        if self._playing is not None:
+            self._playing.cancel()
 
     def close(self) -> None:
         """No more work."""
+        self._stop_playing()
         self._thread.shutdown(wait=False, cancel_futures=True)

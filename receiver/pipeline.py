@@ -99,7 +99,7 @@ def mesh_of(message: bytes, person: int, score_form: ScoreForm = "joining-edges"
 
 @dataclass(frozen=True, slots=True, eq=False)
 class NewMaps:
-    """A residual packet's maps, and their points where these are wanted."""
+    """One frame's maps, and their points where these are wanted."""
 
     maps: ResidualMaps
     points: LinkPoints | None
@@ -217,8 +217,9 @@ class MapPath:
     def counts(self) -> Counter[str]:
         return Counter({"late": self._decoder.late, "without reference": self._decoder.without_reference})
 
-    def take(self, message: bytes, bodies: Callable[[int], Mapping[int, Skeleton]], as_points: bool) -> NewMaps | None:
-        """The maps now, None where the packet shows nothing newer; ``bodies(epoch)``: sizes by revision.
+    def take(self, message: bytes, bodies: Callable[[int], Mapping[int, Skeleton]], as_points: bool) -> list[NewMaps]:
+        """The maps now, several where frames go in groups, [] where the packet shows nothing newer; ``bodies(epoch)``:
+        sizes by revision.
 
         Raises:
             WireError: it cannot be decoded, or is another person's.
@@ -227,8 +228,8 @@ class MapPath:
         if header.person != self._person:
             raise WireError(f"residual packet of person {header.person}, expected {self._person}")
         with self._timer.stage("residual maps"):
-            maps = self._decoder.decode(message, bodies(header.epoch))
-            return None if maps is None else NewMaps(maps, link_points(maps) if as_points else None)
+            found = self._decoder.decode(message, bodies(header.epoch))
+            return [NewMaps(maps, link_points(maps) if as_points else None) for maps in found]
 
 
 def _shown_frame(

@@ -19,12 +19,13 @@ from common.body.skeleton import Skeleton
 from common.geometry.point_cloud import PointCloud
 from common.wire.header import WireError
 from common.wire.map_codec import reference_of
-from common.wire.residual_packet import ResidualHeader, decode_residual, decode_residual_header
+from common.wire.residual_packet import ALONE, ResidualHeader, decode_residual, decode_residual_header
+from common.wire.residual_video import decode_group
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ResidualMaps:
-    """The maps of one packet, with the body they are of."""
+    """The maps of one frame, with the body they are of."""
 
     header: ResidualHeader
     skeleton: Skeleton
@@ -43,14 +44,15 @@ class ResidualDecoder:
         self._referred: tuple[ResidualMaps, LinkMaps] | None = None
         self._most_points = most_points
 
-    def decode(self, data: bytes, bodies: Mapping[int, Skeleton]) -> ResidualMaps | None:
-        """The maps of a packet, then also ``newest``; ``bodies``: skeletons by body revision of the packet's epoch.
+    def decode(self, data: bytes, bodies: Mapping[int, Skeleton]) -> list[ResidualMaps]:
+        """The maps of a packet, one frame's or a group's in order; the last are then ``newest``. ``bodies``: skeletons
+        by body revision of the packet's epoch.
 
-        None where there is nothing newer to show: the packet is late, its body is not known, or the packet it refers to
+        [] where there is nothing newer to show: the packet is late, its body is not known, or the packet it refers to
         is not here; the next key, within a second, helps.
 
         Raises:
-            WireError: not a packet, or of more points than ``most_points``.
+            WireError: not a packet, or of more points than ``most_points``; PyAV is not installed, for a video.
         """
         header = decode_residual_header(data)
         if header.points > self._most_points:
@@ -58,22 +60,25 @@ class ResidualDecoder:
         newest = self.newest
         if newest is not None and newest.header.epoch == header.epoch and header.sequence <= newest.header.sequence:
             self.late += 1
-            return None
+            return []
         skeleton = bodies.get(header.body_revision)
         reference = self._reference(header, skeleton)
-        if skeleton is None or (reference is None and header.kind != "key"):
+        if skeleton is None or (reference is None and header.kind not in ALONE):
             self.without_reference += 1
-            return None
+            return []
         layout = header.layout(skeleton)
-        maps = decode_residual(data, layout, reference)
-        self.newest = ResidualMaps(header, skeleton, layout, maps)
-        if header.kind != "model":
-            self._referred = self.newest, reference_of(maps)
-        return self.newest
+        if header.kind == "video":
+            found = [ResidualMaps(own, skeleton, layout, maps) for own, maps in decode_group(data, layout)]
+        else:
+            found = [ResidualMaps(header, skeleton, layout, decode_residual(data, layout, reference))]
+        self.newest = found[-1]
+        if header.kind in ("key", "previous"):
+            self._referred = self.newest, reference_of(self.newest.maps)
+        return found
 
     def _reference(self, header: ResidualHeader, skeleton: Skeleton | None) -> LinkMaps | None:
         """What a packet is the difference from, if it is here."""
-        if header.kind == "key" or self._referred is None:
+        if header.kind in ALONE or self._referred is None:
             return None
         known, maps = self._referred
         refers = (known.header.epoch, known.header.sequence, known.header.points, known.header.level)

@@ -135,6 +135,5 @@ class SessionPage:
 
 def _due(reader: SessionReader, player: SessionPlayer) -> Iterator[_Due]:
     for message in reader.messages():
-        shown = player.take(message)
-        if shown is not None:
+        for shown in player.take(message):
             yield _Due(message.time_ns, shown, player.payload_bytes["skeleton"], player.payload_bytes["bulk"])

@@ -18,7 +18,7 @@ from common.wire.header import WireError
 from common.wire.residual_packet import is_residual
 from receiver.config import RepositorySettings
 from receiver.incoming_stream import IncomingStream
-from receiver.pipeline import AnimationPath, MapPath, ReceivedPose, Shown, SkeletonToShow, mesh_of
+from receiver.pipeline import AnimationPath, MapPath, NewMaps, ReceivedPose, Shown, SkeletonToShow, mesh_of
 from receiver.viewer.viewer import Viewer, ViewMode
 
 MESHES_WAITING = 8  # for the next skeleton, as in the daemon
@@ -41,11 +41,21 @@ class SessionPlayer:
         self._animation = AnimationPath(settings, timer, clock)
         self._maps = MapPath(person, timer)
         self._modes = modes
+        self._waiting: deque[tuple[int, NewMaps]] = deque()  # and when they are due
         self._arrived: deque[ReceivedPose] = deque(maxlen=MESHES_WAITING)
 
-    def take(self, message: StoredMessage) -> Shown | LinkPoints | None:
-        """Take in the next message; what a skeleton or a residual packet leads to. What is malformed is counted and
-        changes nothing."""
+    def take(self, message: StoredMessage) -> list[Shown | LinkPoints]:
+        """Take in the next message; what a skeleton leads to, and the maps that are due by then. What is malformed is
+        counted and changes nothing."""
+        shown, points = self._take(message), None
+        while self._waiting and self._waiting[0][0] <= message.time_ns:
+            new = self._waiting.popleft()[1]
+            points = new.points
+            if "live" in self._modes:
+                self._animation.live.note_maps(new.maps)
+        return [one for one in (shown, points) if one is not None]
+
+    def _take(self, message: StoredMessage) -> Shown | None:
         channel = channel_of(message.key, self._person)
         self.payload_bytes[channel] += len(message.payload)
         try:
@@ -54,7 +64,7 @@ class SessionPlayer:
             if channel == channels.BODY.name:
                 self._stream.body(message.payload)
             elif channel == channels.BULK.name:
-                return self._take_chunk(message.payload)
+                self._take_chunk(message)
             else:
                 self.counts["of no interest"] += 1
         except WireError as error:
@@ -70,23 +80,23 @@ class SessionPlayer:
         self.counts["shown"] += 1
         return self._animation.show(SkeletonToShow(newest.packet, newest.body, self._arrived))
 
-    def _take_chunk(self, payload: bytes) -> LinkPoints | None:
-        whole = self._stream.chunk(decode_chunk(payload))
+    def _take_chunk(self, message: StoredMessage) -> None:
+        whole = self._stream.chunk(decode_chunk(message.payload))
         if whole is not None and is_residual(whole):
             self.counts["residuals"] += 1
-            return self._take_residual(whole)
-        if whole is not None:
+            self._take_residual(whole, message.time_ns)
+        elif whole is not None:
             self.counts["pose waiting too long"] += len(self._arrived) == MESHES_WAITING
             self._arrived.append(mesh_of(whole, self._person, self._settings.score_form))
             self.counts["poses"] += 1
-        return None
 
-    def _take_residual(self, packet: bytes) -> LinkPoints | None:
+    def _take_residual(self, packet: bytes, now_ns: int) -> None:
+        """Maps wait until they are due: a group's at the pace at which they were captured."""
         live, points = "live" in self._modes, "points" in self._modes
-        new = self._maps.take(packet, self._stream.bodies, points) if live or points else None
-        if new is not None and live:
-            self._animation.live.note_maps(new.maps)
-        return None if new is None else new.points
+        found = self._maps.take(packet, self._stream.bodies, points) if live or points else []
+        if found:
+            behind_ns = now_ns - found[0].maps.header.capture_ns
+            self._waiting = deque((new.maps.header.capture_ns + behind_ns, new) for new in found)
 
 
 def channel_of(key: str, person: int) -> str:
@@ -120,8 +130,7 @@ def display_ticks(
         while now_ns - begin_ns > _tick_ns(tick, rate_hz):
             yield tick
             tick += 1
-        shown = player.take(message)
-        if shown is not None:
+        for shown in player.take(message):
             put_on(viewer, shown)
     if begin_ns is not None:
         yield tick

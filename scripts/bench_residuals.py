@@ -106,7 +106,7 @@ def _residual(sequence: PosedSequence, method: str, level: float) -> Measured:
         coded = time.perf_counter()
         if packet is not None:
             received = theirs.decode(packet, {frame.body_revision: frame.skeleton})
-            assert received is not None
+            assert received
         assert theirs.newest is not None
         shown = cloud(theirs.newest, frame.T_world_link)
         out.decode_s.append(time.perf_counter() - coded)

@@ -113,13 +113,17 @@ class CandidateSettings:
 class ResidualStreamSettings:
     """Residual maps: what the skeleton misses, for receivers that show points or a live mesh. ``mode``: "auto" sends
     them to whoever asks, at the level bandwidth allows. ``share``: for points, of the bandwidth that candidate poses
-    have a use for, too. ``points``: of a frame at the full level."""
+    have a use for, too. ``points``: of a frame at the full level. ``video_frames``: so many frames are coded together,
+    as a short video, which shows them that much later (0: each by itself; needs the ``video`` extra at both ends)."""
 
     mode: Literal["off", "auto"] = "auto"
     share: float = 0.5
     points: int = 10_000
+    video_frames: int = 0
 
     def __post_init__(self) -> None:
+        if self.video_frames and not 2 <= self.video_frames <= 30:
+            raise ValueError(f"video_frames: {self.video_frames} is neither 0 nor 2..30")
         if not 0.05 <= self.share <= 0.95:
             raise ValueError(f"share: {self.share} is outside 0.05..0.95")
         if not 1000 <= self.points <= 200_000:

@@ -24,6 +24,7 @@ from common.runtime.stage_timer import StageTimer
 from common.transport.access_rules import Allowance, for_sender
 from common.transport.link_settings import LinkSettings, with_endpoints
 from common.transport.zenoh_session import ZenohSession, open_session, own_certificate
+from common.wire.residual_video import VideoUnavailable
 from sender.body_store import BodyStore
 from sender.candidate_poses.candidate_pace import CandidatePace
 from sender.candidate_poses.mesh_scheduler import MeshScheduler, SendRecord
@@ -82,6 +83,8 @@ class SenderDaemon:
                         await asyncio.to_thread(source.close)
                 except CaptureError as error:
                     raise DaemonError(str(error)) from error
+                except VideoUnavailable as error:
+                    raise DaemonError(f"[residuals] video_frames: {error}") from error
                 except OpenClUnavailable as error:
                     raise DaemonError(f'[tracking] weights = "opencl": {error}') from error
 
@@ -259,7 +262,7 @@ class _Stream:
         if bytes_per_s is None or seldom:
             return
         self._mapped_ns = tracked.capture_ns
-        self._residuals.note_budget(bytes_per_s)
+        self._residuals.note_budget(bytes_per_s, self._links.wants_points)
         if self._links.lacks_residual_key:
             self._residuals.request_key()
         self._mapping.submit(tracked)

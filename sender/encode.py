@@ -11,6 +11,7 @@ from common.runtime.clock import MonotonicClock
 from common.runtime.progress import ProgressLine
 from common.runtime.session_recording import RecordingError, SessionWriter
 from common.transport.channels import SCHEMA
+from common.wire.residual_video import VideoUnavailable
 from sender.capture.frame_set import CaptureError
 from sender.capture.open_source import open_player
 from sender.capture.recorded_rig import RecordedRig
@@ -49,7 +50,7 @@ def encode(settings: SenderSettings, options: EncodeOptions, say: Callable[[str]
             return _encode(settings, options, source, say)
         finally:
             source.close()
-    except (CaptureError, RecordingError, OpenClUnavailable) as error:
+    except (CaptureError, RecordingError, OpenClUnavailable, VideoUnavailable) as error:
         raise EncodeError(str(error)) from error
 
 

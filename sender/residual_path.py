@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from common.geometry.camera_model import Camera
 from common.runtime.stage_timer import StageTimer
 from common.wire.residual_packet import decode_residual_header
+from common.wire.residual_video import frame_count, require_video
 from sender.config import ResidualStreamSettings
 from sender.pipeline import StreamIdentity, TrackedFrame
 from sender.reconstruction.foreground_points import PointSampler
@@ -33,7 +34,11 @@ class Residual:
 
 
 class ResidualPath:
-    """``process`` is one thread's own; ``note_budget`` and ``request_key`` may be called from another."""
+    """``process`` is one thread's own; ``note_budget`` and ``request_key`` may be called from another.
+
+    Raises:
+        VideoUnavailable: frames are to be coded as video, and PyAV is not installed.
+    """
 
     def __init__(
         self,
@@ -44,7 +49,10 @@ class ResidualPath:
         timer: StageTimer,
     ) -> None:
         self._sampler = PointSampler(cameras, settings.points, voxel_m=VOXEL_M)
-        self._encoder = ResidualEncoder(identity.person, identity.epoch, ResidualSettings(points=settings.points))
+        if settings.video_frames:
+            require_video()
+        coding = ResidualSettings(points=settings.points, video_frames=settings.video_frames)
+        self._encoder = ResidualEncoder(identity.person, identity.epoch, coding)
         self._control = LevelControl()
         self._timer = timer
         self._budget_bytes_s = 0.0
@@ -52,17 +60,21 @@ class ResidualPath:
         self._last_ns: int | None = None
         self._smoothed = 0.0
         self._key_wanted = False
+        self._together = True
 
-    def note_budget(self, bytes_per_s: float) -> None:
-        """What residuals may take."""
+    def note_budget(self, bytes_per_s: float, for_points: bool = True) -> None:
+        """What residuals may take. ``for_points``: those of every frame are wanted; a few, for a live surface, do not
+        go in groups, which they would take too long to fill."""
         self._budget_bytes_s = bytes_per_s
+        self._together = for_points
 
     def request_key(self) -> None:
         """Somebody has none."""
         self._key_wanted = True
 
     def process(self, tracked: TrackedFrame) -> Residual | None:
-        """The packet of a frame; None where nobody is seen, or the level is 0 and the model is out."""
+        """The packet of a frame or of the group it completes; None where nobody is seen, the level is 0 and the model
+        is out, or the group is not complete."""
         if not tracked.views or tracked.skeleton is None or tracked.T_world_link is None:
             return None
         level = self._control.level(self._budget(tracked.capture_ns) * self._interval_ns / 1e9)
@@ -80,11 +92,12 @@ class ResidualPath:
                 tracked.capture_ns,
                 cloud,
             )
-            data = self._encoder.encode(frame, level)
+            data = self._encoder.encode(frame, level, self._together)
         if data is None:
             return None
         header = decode_residual_header(data)
-        self._control.coded(header.level, len(data))
+        frames = frame_count(data)
+        self._control.coded(header.level, len(data) / frames, frames)
         return Residual(header.sequence, header.reference, data, header.level)
 
     def _budget(self, capture_ns: int) -> float:

@@ -6,12 +6,15 @@ import asyncio
 import threading
 from collections.abc import Callable
 
+import pytest
+
 from common.runtime.clock import ManualClock
 from common.runtime.stage_timer import StageTimer
 from receiver.map_maker import WAITING, MapMaker
 from receiver.pipeline import MapPath, NewMaps
+from sender.residual_encoder import ResidualEncoder, ResidualSettings
 from tests.posed_cloud import BODY
-from tests.test_residual_stream import encoder, sent
+from tests.test_residual_stream import FRAME_NS, encoder, frame, sent
 
 EPOCH = 9
 
@@ -27,7 +30,7 @@ class Made:
         path = MapPath(0, StageTimer(ManualClock()))
         take = path.take
 
-        def when_let(*arguments: object) -> NewMaps | None:
+        def when_let(*arguments: object) -> list[NewMaps]:
             assert self.go_on.wait(10)
             return take(*arguments)  # type: ignore[arg-type]
 
@@ -82,6 +85,33 @@ async def test_one_that_is_behind_shows_the_newest_and_junk_is_counted():
     await until(lambda: made.maker.counts["late"] >= 1)
     assert made.maker.counts["waiting too long"] == 2 * WAITING
     assert not running.done()
+    running.cancel()
+    made.maker.close()
+
+
+async def test_a_group_is_shown_at_the_pace_it_was_captured_at_until_there_is_a_newer_one():
+    pytest.importorskip("av")
+    made = Made()
+    ours = ResidualEncoder(0, EPOCH, ResidualSettings(points=3000, video_frames=6))
+    first, second = (packet for k in range(12) if (packet := ours.encode(frame(k), 50.0)) is not None)
+    running = asyncio.create_task(made.maker.run())
+    made.maker.submit(b"\x72\x03" + first[2:-9])
+    await until(lambda: made.maker.counts["refused"] == 1)
+    made.maker.submit(first)
+    await until(lambda: len(made.shown) == 1)
+    loop = asyncio.get_running_loop()
+    begun_s = loop.time()
+    await until(lambda: len(made.shown) == 6)
+    assert loop.time() - begun_s > 0.9 * 4 * FRAME_NS / 1e9
+    made.maker.submit(second)
+    await until(lambda: len(made.shown) == 7)
+    third = [packet for k in range(12, 18) if (packet := ours.encode(frame(k), 50.0)) is not None]
+    made.maker.submit(third[0])
+    await until(lambda: any(new.maps.header.sequence == 17 for new in made.shown))
+    shown = [new.maps.header.sequence for new in made.shown]
+    assert shown[:7] == list(range(7))
+    assert shown == sorted(shown)
+    assert made.maker.made == 3
     running.cancel()
     made.maker.close()
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import signal
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import aclosing
 from dataclasses import replace
@@ -21,7 +22,8 @@ from common.runtime.session_recording import SessionReader, SessionWriter, Store
 from common.transport.channels import CHANNELS
 from common.transport.chunks import ChunkAssembler, decode_chunk
 from common.transport.temporal_layers import LAYERS, layer_of
-from common.wire.residual_packet import is_residual
+from common.wire.residual_packet import decode_residual_header, is_residual
+from common.wire.residual_video import frame_count
 from common.wire.skeleton_packet import decode_skeleton, encode_skeleton
 from receiver.cli import run_decode
 from receiver.config import ReceiverSettings, ViewSettings
@@ -52,6 +54,14 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def session(recording: Path) -> Path:
     file = recording.parent / "session.mcap"
     encoded(recording, file)
+    return file
+
+
+@pytest.fixture(scope="module")
+def video_session(recording: Path) -> Path:
+    pytest.importorskip("av")
+    file = recording.parent / "video.mcap"
+    encoded(recording, file, settings=SenderSettings(residuals=ResidualStreamSettings(video_frames=8)))
     return file
 
 
@@ -91,6 +101,32 @@ def whole_messages(stored: list[StoredMessage]) -> list[bytes]:
 def test_the_same_recording_gives_the_same_file(recording, session, tmp_path):
     encoded(recording, tmp_path / "again.mcap")
     assert (tmp_path / "again.mcap").read_bytes() == session.read_bytes()
+
+
+def test_residual_maps_as_video_come_one_group_later_and_show_the_person(video_session, tmp_path):
+    late_s, assembler = [], ChunkAssembler()
+    for message in SessionReader(video_session, "v1").messages():
+        whole = assembler.push(decode_chunk(message.payload)) if "/bulk/" in message.key else None
+        if whole is not None and is_residual(whole):
+            header = decode_residual_header(whole)
+            assert (header.kind, frame_count(whole)) == ("video", 8)
+            late_s.append((message.time_ns - header.capture_ns) / 1e9)
+    assert len(late_s) >= 2
+    assert all(7 / RATE_HZ <= late < 16 / RATE_HZ for late in late_s)  # to fill a group, and to send it
+    points, said = ReceiverSettings(view=ViewSettings(headless=True, mode="points")), []
+    assert decode(points, DecodeOptions(video_session, tmp_path / "png"), said.append) == 0
+    picture = cv2.imread(str(sorted((tmp_path / "png").iterdir())[-1]))[..., ::-1]
+    assert psnr_db(np.ascontiguousarray(picture), FRAMES) > 22
+
+
+def test_maps_as_video_without_pyav_are_a_clear_error_at_both_ends(recording, video_session, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "av", None)
+    with pytest.raises(SystemExit, match=r"pip install '\.\[video\]'"):
+        run_encode([str(recording), str(tmp_path / "none.mcap"), "--residual-video", "8"])
+    assert not (tmp_path / "none.mcap").exists()
+    points, said = ReceiverSettings(view=ViewSettings(headless=True, mode="points")), []
+    assert decode(points, DecodeOptions(video_session, tmp_path / "png"), said.append) == 0
+    assert "messages could not be read, the last one: residual maps as video need the video extra" in said[-1]
 
 
 def test_bandwidth_bounds_the_file_and_the_summary_counts_it(recording, tmp_path):

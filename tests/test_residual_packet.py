@@ -98,7 +98,7 @@ def test_a_level_of_hundredths_gives_both_ends_the_same_grids(level: float) -> N
         (KEY_BYTES[:30], "fewer than its header"),
         (KEY_BYTES[:-1] + b"\x00", "checksum"),
         (checksummed(KEY_BYTES[:-8]), "its sections have"),
-        (patched(KIND_AT, "B", 3), "kind"),
+        (patched(KIND_AT, "B", 4), "kind"),
         (patched(KIND_AT, "B", 1), "model packet 41 refers to 41"),
         (patched(REFERENCE_AT, "<I", 40), "key packet 41 refers to 40"),
         (patched(CAPTURE_AT, "<q", -1), "capture time"),

@@ -11,6 +11,7 @@ from common.runtime.clock import ManualClock
 from common.runtime.stage_timer import StageTimer
 from common.wire.body_message import decode_body
 from common.wire.residual_packet import decode_residual_header
+from common.wire.residual_video import frame_count
 from receiver.residual_decoder import ResidualDecoder, cloud
 from sender.config import ResidualStreamSettings
 from sender.pipeline import TrackedFrame
@@ -18,9 +19,9 @@ from sender.residual_path import Residual, ResidualPath
 from tests.rig_scene import IDENTITY, RATE_HZ, performer, renderer, tracked
 
 
-def path() -> ResidualPath:
-    timer = StageTimer(ManualClock())
-    return ResidualPath(IDENTITY, renderer().cameras, RATE_HZ, ResidualStreamSettings(), timer)
+def path(video_frames: int = 0) -> ResidualPath:
+    timer, settings = StageTimer(ManualClock()), ResidualStreamSettings(video_frames=video_frames)
+    return ResidualPath(IDENTITY, renderer().cameras, RATE_HZ, settings, timer)
 
 
 def frames() -> list[TrackedFrame]:
@@ -79,6 +80,18 @@ def test_a_key_comes_when_it_is_asked_for_and_once():
     ours.request_key()
     kinds = [decode_residual_header(packet.data).kind for packet in coded(ours, 1e5, frames()[3:6])]
     assert kinds == ["key", "model", "model"]
+
+
+def test_groups_take_what_they_may_and_a_live_surface_gets_frames_by_themselves():
+    pytest.importorskip("av")
+    ours = path(video_frames=5)
+    groups = coded(ours, 30_000, frames() * 3)
+    assert [packet.sequence for packet in groups] == [5 * n for n in range(len(groups))]
+    assert all(packet.key == packet.sequence and frame_count(packet.data) == 5 for packet in groups)
+    spent = sum(len(packet.data) for packet in groups[4:]) / (5 * len(groups[4:])) * RATE_HZ
+    assert spent == pytest.approx(30_000, rel=0.3)
+    ours.note_budget(30_000, for_points=False)
+    assert all(frame_count(packet.data) == 1 for frame in frames()[:4] if (packet := ours.process(frame)))
 
 
 def test_a_frame_without_views_gives_nothing():

@@ -60,8 +60,8 @@ def reference_of(maps: LinkMaps) -> LinkMaps:
     """Decoded maps as what others differ from: empty cells are like the full ones in their block, which is where a cell
     new in the next frame starts from."""
     colour, radius = np.empty_like(maps.colour), np.empty((*maps.radius.shape, 1), np.uint8)
-    _fill(maps.colour, maps.full, np.full(3, _MIDDLE, np.uint8), colour)
-    _fill(maps.radius[..., None], maps.full, np.zeros(1, np.uint8), radius)
+    fill_empty(maps.colour, maps.full, np.full(3, _MIDDLE, np.uint8), colour)
+    fill_empty(maps.radius[..., None], maps.full, np.zeros(1, np.uint8), radius)
     return LinkMaps(maps.full, colour, radius[..., 0])
 
 
@@ -69,13 +69,13 @@ def encode_maps(
     layout: MapLayout, maps: LinkMaps, quality: MapQuality, reference: LinkMaps | None = None
 ) -> MapSections:
     """The sections of ``maps``, or of how they differ from ``reference`` (``reference_of`` maps of the same layout)."""
-    occupancy = zstandard.ZstdCompressor(level=_ZSTD_LEVEL).compress(np.packbits(maps.full).tobytes())
+    occupancy = encode_occupancy(maps.full[None])
     radius = _encode_radius(layout, maps, quality, None)
     differing = radius if reference is None else _encode_radius(layout, maps, quality, reference)
     differs = len(differing) < len(radius)
     colour = maps.colour if reference is None else _difference(maps.colour, reference.colour)
     filled = np.empty_like(colour)
-    _fill(colour, maps.full, np.full(3, _MIDDLE, np.uint8), filled)
+    fill_empty(colour, maps.full, np.full(3, _MIDDLE, np.uint8), filled)
     _, jpeg = cv2.imencode(".jpg", cv2.cvtColor(filled, cv2.COLOR_RGB2BGR), _jpeg_settings(quality.jpeg))
     start = _jpeg_start(layout.height, layout.width, quality.jpeg)
     data = jpeg.tobytes()
@@ -91,19 +91,35 @@ def decode_maps(
     Raises:
         WireError: sections that no encoder writes for this layout.
     """
-    height, width = layout.height, layout.width
-    bits = np.frombuffer(_decompressed("occupancy", sections.occupancy, -(-height * width // 8)), np.uint8)
-    full = np.unpackbits(bits, count=height * width).reshape(height, width).view(np.bool_)
-    if np.count_nonzero(full) != _full_in_grids(layout.places, full):
-        raise WireError("occupancy: cells are full that belong to no link")
+    full = decode_occupancy(layout, sections.occupancy, 1)[0]
     if sections.radius_differs and reference is None:
         raise WireError("radius: a difference without a reference")
     radius = _decode_radius(layout, sections.radius, full, quality, reference if sections.radius_differs else None)
-    colour = _decode_colour(sections.colour, height, width, quality.jpeg)
+    colour = _decode_colour(sections.colour, layout.height, layout.width, quality.jpeg)
     if reference is not None:
         colour = np.clip(reference.colour.astype(np.int16) + colour - _MIDDLE, 0, 255).astype(np.uint8)
     colour *= full[..., None]
     return LinkMaps(full, colour, radius)
+
+
+def encode_occupancy(full: NDArray[np.bool_]) -> bytes:
+    """Which cells (N, H, W) of N frames are full."""
+    return bytes(zstandard.ZstdCompressor(level=_ZSTD_LEVEL).compress(np.packbits(full).tobytes()))
+
+
+def decode_occupancy(layout: MapLayout, data: bytes, frames: int) -> NDArray[np.bool_]:
+    """(N, H, W) of ``encode_occupancy``'s bytes, for N = ``frames``.
+
+    Raises:
+        WireError: another number of cells, or cells are full that are none of a link's.
+    """
+    shape = frames, layout.height, layout.width
+    cells = frames * layout.height * layout.width
+    bits = np.frombuffer(_decompressed("occupancy", data, -(-cells // 8)), np.uint8)
+    full = np.unpackbits(bits, count=cells).reshape(shape).view(np.bool_)
+    if any(np.count_nonzero(one) != _full_in_grids(layout.places, one) for one in full):
+        raise WireError("occupancy: cells are full that belong to no link")
+    return full
 
 
 def _encode_radius(layout: MapLayout, maps: LinkMaps, quality: MapQuality, reference: LinkMaps | None) -> bytes:
@@ -220,7 +236,7 @@ def _decode_colour(scan: bytes, height: int, width: int, quality: int) -> NDArra
 
 
 @njit(nogil=True, cache=True)
-def _fill(values, full, start, out):  # type: ignore[no-untyped-def]
+def fill_empty(values, full, start, out):  # type: ignore[no-untyped-def]
     """Copies ``values`` (H, W, C), whole blocks, to ``out``; an empty cell gets the mean of its block's full ones, a
     block without any that of the block before it: no difference to it, which costs a JPEG one bit."""
     height, width, channels = values.shape

@@ -8,7 +8,8 @@ Where each link's grid lies follows from the body, ``points`` and ``level`` (``m
 
 Kinds. "key": by itself. "model": the difference from the last key, which is the model P_l of §5.2 as a map, moved by
 the skeleton: a lost one harms no other. "previous": the difference from the packet before (§5.2, Fig. 5c): fewer bytes
-while nothing is lost, nothing to see from a loss to the next key.
+while nothing is lost, nothing to see from a loss to the next key. "video": several frames from its capture time on, by
+themselves (``residual_video``).
 """
 
 from __future__ import annotations
@@ -38,8 +39,9 @@ from common.wire.map_codec import RADIUS_CODINGS, RADIUS_STEPS_MAX, MapQuality, 
 RESIDUAL_MAX_BYTES = 1 << 21
 LEVEL_STEP = 0.01  # %
 
-Kind = Literal["key", "model", "previous"]
-_KINDS: tuple[Kind, ...] = ("key", "model", "previous")
+Kind = Literal["key", "model", "previous", "video"]
+ALONE: tuple[Kind, ...] = ("key", "video")  # decode without another packet
+_KINDS: tuple[Kind, ...] = ("key", "model", "previous", "video")
 _HEADER = struct.Struct("<BBBBIIIIqIHBBIII")
 _CRC = struct.Struct("<I")
 _CODING_SHIFT, _STEPS_MASK, _RADIUS_DIFFERS = 5, 31, 128
@@ -49,10 +51,11 @@ _CODING_SHIFT, _STEPS_MASK, _RADIUS_DIFFERS = 5, 31, 128
 class ResidualHeader:
     """What a packet says before its maps.
 
-    ``sequence``: number of the packet in the sender's run ``epoch``; ``reference``: the sequence of the packet it is
-    the difference from, its own for a key. ``skeleton_sequence``: the skeleton packet of the same frame, by whose pose
-    points were put into links; ``body_revision``: the body message whose sizes the grids go by. ``capture_ns``: the
-    sender's monotonic clock [ns]. ``points``: N of the layout; ``level``: 1..100 % of the full grids, in hundredths.
+    ``sequence``: number of the frame in the sender's run ``epoch``; ``reference``: that of the packet it is the
+    difference from, its own for one that is none. ``skeleton_sequence``: the skeleton packet of the same frame, by
+    whose pose points were put into links; ``body_revision``: the body message whose sizes the grids go by.
+    ``capture_ns``: the sender's monotonic clock [ns]. ``points``: N of the layout; ``level``: 1..100 % of the full
+    grids, in hundredths.
     """
 
     person: int
@@ -86,12 +89,21 @@ def encode_residual(header: ResidualHeader, layout: MapLayout, maps: LinkMaps, r
     Raises:
         WireError: a number outside its range, or more than ``RESIDUAL_MAX_BYTES``.
     """
+    assert header.kind != "video"
     assert (reference is None) == (header.kind == "key")
-    sections = encode_maps(layout, maps, header.quality, reference)
+    return packed(header, encode_maps(layout, maps, header.quality, reference))
+
+
+def packed(header: ResidualHeader, sections: MapSections) -> bytes:
+    """Bytes of a packet of any kind.
+
+    Raises:
+        WireError: as ``encode_residual``.
+    """
     quality = header.quality
     steps = checked_int("radius steps", quality.radius_steps, 1, RADIUS_STEPS_MAX)
     differs = _RADIUS_DIFFERS if sections.radius_differs else 0
-    packed = _HEADER.pack(
+    head = _HEADER.pack(
         RESIDUAL_VERSION,
         _KINDS.index(header.kind),
         checked_int("person", header.person, 0, U8_MAX),
@@ -109,7 +121,7 @@ def encode_residual(header: ResidualHeader, layout: MapLayout, maps: LinkMaps, r
         len(sections.radius),
         len(sections.colour),
     )
-    body = packed + sections.occupancy + sections.radius + sections.colour
+    body = head + sections.occupancy + sections.radius + sections.colour
     data = body + _CRC.pack(zlib.crc32(body))
     if len(data) > RESIDUAL_MAX_BYTES:
         raise WireError(f"residual packet: {len(data)} bytes, at most {RESIDUAL_MAX_BYTES} are allowed")
@@ -124,14 +136,15 @@ def is_residual(message: bytes) -> bool:
 def needed_packets(waiting: Sequence[bytes]) -> list[bytes]:
     """Of packets in the order they came, those that have to be decoded to show the newest: it, and the last key or, of
     differences from the packet before, all since that key. What is no packet is kept: to be refused by its decoder."""
-    keys = [number for number, packet in enumerate(waiting) if _kind(packet) == "key"]
+    keys = [number for number, packet in enumerate(waiting) if packet_kind(packet) in ALONE]
     since_key = list(waiting[keys[-1] :] if keys else waiting)
-    if not all(_kind(packet) in ("key", "model") for packet in since_key):
+    if not all(packet_kind(packet) in (*ALONE, "model") for packet in since_key):
         return since_key
     return since_key if len(since_key) == 1 else [*(since_key[:1] if keys else []), since_key[-1]]
 
 
-def _kind(packet: bytes) -> Kind | None:
+def packet_kind(packet: bytes) -> Kind | None:
+    """What a message claims to be; None: no residual packet."""
     return _KINDS[packet[1]] if is_residual(packet) and len(packet) > 1 and packet[1] < len(_KINDS) else None
 
 
@@ -141,7 +154,7 @@ def decode_residual_header(data: bytes) -> ResidualHeader:
     Raises:
         WireError: wrong length, version or checksum, or a number outside its range.
     """
-    return _parse(data)[0]
+    return parsed(data)[0]
 
 
 def decode_residual(data: bytes, layout: MapLayout, reference: LinkMaps | None) -> LinkMaps:
@@ -151,7 +164,9 @@ def decode_residual(data: bytes, layout: MapLayout, reference: LinkMaps | None) 
     Raises:
         WireError: anything that is not exactly one packet for this layout, or a reference where none belongs.
     """
-    header, sections = _parse(data)
+    header, sections = parsed(data)
+    if header.kind == "video":
+        raise WireError("residual packet: a video packet holds several frames")
     if (reference is None) != (header.kind == "key"):
         raise WireError(f"residual packet: a {header.kind} packet with{'out' if reference is None else ''} a reference")
     if reference is not None and reference.full.shape != (layout.height, layout.width):
@@ -159,7 +174,12 @@ def decode_residual(data: bytes, layout: MapLayout, reference: LinkMaps | None) 
     return decode_maps(layout, sections, header.quality, reference)
 
 
-def _parse(data: bytes) -> tuple[ResidualHeader, MapSections]:
+def parsed(data: bytes) -> tuple[ResidualHeader, MapSections]:
+    """Header and sections of a packet of any kind.
+
+    Raises:
+        WireError: as ``decode_residual_header``.
+    """
     check_start("residual packet", data, RESIDUAL_VERSION, RESIDUAL_MAX_BYTES)
     if len(data) < _HEADER.size + _CRC.size:
         raise WireError(f"residual packet: {len(data)} bytes are fewer than its header and checksum")
@@ -173,7 +193,7 @@ def _parse(data: bytes) -> tuple[ResidualHeader, MapSections]:
     if len(data) != _HEADER.size + sum(sizes) + _CRC.size:
         raise WireError(f"residual packet: {len(data)} bytes, its sections have {sum(sizes)}")
     name = _KINDS[checked_int("kind", kind, 0, len(_KINDS) - 1)]
-    if (reference == sequence) != (name == "key"):
+    if (reference == sequence) != (name in ALONE):
         raise WireError(f"residual packet: {name} packet {sequence} refers to {reference}")
     index = checked_int("radius coding", (coding & ~_RADIUS_DIFFERS) >> _CODING_SHIFT, 0, len(RADIUS_CODINGS) - 1)
     quality = MapQuality(
