@@ -95,7 +95,7 @@ async def test_a_group_is_shown_at_the_pace_it_was_captured_at_until_there_is_a_
     ours = ResidualEncoder(0, EPOCH, ResidualSettings(points=3000, video_frames=6))
     first, second = (packet for k in range(12) if (packet := ours.encode(frame(k), 50.0)) is not None)
     running = asyncio.create_task(made.maker.run())
-    made.maker.submit(b"\x72\x03" + first[2:-9])
+    made.maker.submit(b"\x73\x03" + first[2:-9])
     await until(lambda: made.maker.counts["refused"] == 1)
     made.maker.submit(first)
     await until(lambda: len(made.shown) == 1)

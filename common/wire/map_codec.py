@@ -1,6 +1,6 @@
 """One frame's link maps in three sections of bytes: which cells are full, their radii, their colours.
 
-Occupancy: a bit a cell, zstd. Radius: rounded to a step, what its neighbours to the left and above let expect taken off
+Occupancy: ``mask_codec``. Radius: rounded to a step, what its neighbours to the left and above let expect taken off
 (the median of left, above and left + above - corner), full cells only, in deflate's Huffman code without its matches,
 which in noise are none: zstd, which looks for them, takes a third more. Or a PNG of the rounded map. Colour: JPEG with
 chroma at half resolution, without its header, which is the same for all pictures of one size and quality and is 600
@@ -19,18 +19,17 @@ from functools import lru_cache
 
 import cv2
 import numpy as np
-import zstandard
 from numba import njit
 from numpy.typing import NDArray
 
 from common.body.cylindrical_map import LinkMaps
 from common.body.map_layout import BLOCK, MapLayout
 from common.wire.header import WireError
+from common.wire.mask_codec import decode_masks, encode_masks
 
 RADIUS_STEPS_MAX = 16  # of 2 mm
 RADIUS_CODINGS = ("huffman", "png")
 
-_ZSTD_LEVEL = 3  # higher levels gain a hundredth
 _START_OF_SCAN, _END = b"\xff\xda", b"\xff\xd9"
 _MIDDLE = 128  # a colour difference of zero; beyond ±127 it is cut
 _PNG_START, _PNG_CHUNKS = b"\x89PNG\r\n\x1a\n", {b"IHDR", b"IDAT", b"IEND"}
@@ -69,7 +68,7 @@ def encode_maps(
     layout: MapLayout, maps: LinkMaps, quality: MapQuality, reference: LinkMaps | None = None
 ) -> MapSections:
     """The sections of ``maps``, or of how they differ from ``reference`` (``reference_of`` maps of the same layout)."""
-    occupancy = encode_occupancy(maps.full[None])
+    occupancy = encode_masks(layout.places, maps.full[None], None if reference is None else reference.full)
     radius = _encode_radius(layout, maps, quality, None)
     differing = radius if reference is None else _encode_radius(layout, maps, quality, reference)
     differs = len(differing) < len(radius)
@@ -91,7 +90,9 @@ def decode_maps(
     Raises:
         WireError: sections that no encoder writes for this layout.
     """
-    full = decode_occupancy(layout, sections.occupancy, 1)[0]
+    shape = 1, layout.height, layout.width
+    before = None if reference is None else reference.full
+    full = decode_masks(layout.places, sections.occupancy, shape, before)[0]
     if sections.radius_differs and reference is None:
         raise WireError("radius: a difference without a reference")
     radius = _decode_radius(layout, sections.radius, full, quality, reference if sections.radius_differs else None)
@@ -100,26 +101,6 @@ def decode_maps(
         colour = np.clip(reference.colour.astype(np.int16) + colour - _MIDDLE, 0, 255).astype(np.uint8)
     colour *= full[..., None]
     return LinkMaps(full, colour, radius)
-
-
-def encode_occupancy(full: NDArray[np.bool_]) -> bytes:
-    """Which cells (N, H, W) of N frames are full."""
-    return bytes(zstandard.ZstdCompressor(level=_ZSTD_LEVEL).compress(np.packbits(full).tobytes()))
-
-
-def decode_occupancy(layout: MapLayout, data: bytes, frames: int) -> NDArray[np.bool_]:
-    """(N, H, W) of ``encode_occupancy``'s bytes, for N = ``frames``.
-
-    Raises:
-        WireError: another number of cells, or cells are full that are none of a link's.
-    """
-    shape = frames, layout.height, layout.width
-    cells = frames * layout.height * layout.width
-    bits = np.frombuffer(_decompressed("occupancy", data, -(-cells // 8)), np.uint8)
-    full = np.unpackbits(bits, count=cells).reshape(shape).view(np.bool_)
-    if any(np.count_nonzero(one) != _full_in_grids(layout.places, one) for one in full):
-        raise WireError("occupancy: cells are full that belong to no link")
-    return full
 
 
 def _encode_radius(layout: MapLayout, maps: LinkMaps, quality: MapQuality, reference: LinkMaps | None) -> bytes:
@@ -158,20 +139,6 @@ def _rounded(radius: NDArray[np.uint8], step: int) -> NDArray[np.uint8]:
 
 def _difference(colour: NDArray[np.uint8], known: NDArray[np.uint8]) -> NDArray[np.uint8]:
     return np.clip(colour.astype(np.int16) - known + _MIDDLE, 0, 255).astype(np.uint8)
-
-
-def _decompressed(section: str, data: bytes, size: int) -> bytes:
-    """``size`` bytes of a zstd frame; one that declares another size is refused before anything is allocated."""
-    try:
-        declared = zstandard.get_frame_parameters(data).content_size
-        if declared != size:
-            raise WireError(f"{section}: declares {declared} bytes, expected {size}")
-        out = zstandard.ZstdDecompressor().decompress(data, max_output_size=size, allow_extra_data=False)
-    except zstandard.ZstdError as error:
-        raise WireError(f"{section}: {error}") from error
-    if len(out) != size:
-        raise WireError(f"{section}: {len(out)} bytes, expected {size}")
-    return bytes(out)
 
 
 def _inflated(data: bytes, size: int) -> bytes:
@@ -262,17 +229,6 @@ def fill_empty(values, full, start, out):  # type: ignore[no-untyped-def]
                     kept = full[v, u]
                     for c in range(channels):
                         out[v, u, c] = values[v, u, c] if kept else mean[c]
-
-
-@njit(nogil=True, cache=True)
-def _full_in_grids(places, full):  # type: ignore[no-untyped-def]
-    count = 0
-    for link in range(len(places)):
-        top, left, rows, columns = places[link]
-        for v in range(top, top + rows):
-            for u in range(left, left + columns):
-                count += full[v, u]
-    return count
 
 
 @njit(nogil=True, cache=True)

@@ -8,9 +8,9 @@ mean of those frames in which it is full, so that it does not change. Each group
 The delay: nothing of a group can be shown before its last frame is captured.
 
 Layout of the sections. Occupancy: N u8, N × (time since the group's first frame u32 [ns], skeleton packets since its
-u16), bit masks of N frames, zstd. Radius, colour: NAL units, each behind 0 0 1: one set of parameters, N pictures of
-one slice. FFmpeg decodes them, which must not be led astray: other units are refused before, pictures that are not of
-the layout's size before they are allocated.
+u16), masks of N frames (``mask_codec``). Radius, colour: NAL units, each behind 0 0 1: one set of parameters, N
+pictures of one slice. FFmpeg decodes them, which must not be led astray: other units are refused before, pictures that
+are not of the layout's size before they are allocated.
 """
 
 from __future__ import annotations
@@ -29,7 +29,8 @@ from numpy.typing import NDArray
 from common.body.cylindrical_map import LinkMaps
 from common.body.map_layout import CELLS_MAX, MapLayout
 from common.wire.header import TIME_MAX_NS, U32_MAX, WireError, checked_int
-from common.wire.map_codec import MapQuality, MapSections, decode_occupancy, encode_occupancy, fill_empty
+from common.wire.map_codec import MapQuality, MapSections, fill_empty
+from common.wire.mask_codec import decode_masks, encode_masks
 from common.wire.residual_packet import ResidualHeader, packed, parsed
 
 if TYPE_CHECKING:
@@ -98,7 +99,7 @@ def encode_group(header: ResidualHeader, layout: MapLayout, frames: Sequence[Gro
     return packed(
         header,
         MapSections(
-            table + encode_occupancy(full),
+            table + encode_masks(layout.places, full, None),
             _encode_video(list(radii), "gray", layout, _radius_crf(header.quality)),
             _encode_video(planes, "yuv420p", layout, _colour_crf(header.quality)),
         ),
@@ -120,7 +121,7 @@ def decode_group(data: bytes, layout: MapLayout) -> list[tuple[ResidualHeader, L
     begin = 1 + count * _FRAME.size
     if len(sections.occupancy) < begin:
         raise WireError(f"residual video: its table of {count} frames is cut")
-    full = decode_occupancy(layout, sections.occupancy[begin:], count)
+    full = decode_masks(layout.places, sections.occupancy[begin:], (count, layout.height, layout.width), None)
     radii = [planes[: layout.height] for planes in _decode_video("radius", sections.radius, layout, count)]
     colours = _decode_video("colour", sections.colour, layout, count)
     out = []
