@@ -3,6 +3,10 @@
 Cases are ``body/motion/cameras/method/level``. Synthetic people before virtual cameras with a sensor's noise, poses by
 our own tracker, each motion repeated to 20 s; real recordings with ``--clips``. Figures are against the 10 000 points a
 frame that go in (``scripts/residual_quality.py``); a residual frame's bytes include the skeleton packet.
+
+"residual-video": groups of eight frames as a short video. ``psnr_db`` is of everything shown so late that all of it is
+of one instant, ``psnr_late_db`` of skeletons shown at once and maps when they come. ``added_delay_ms``: from capturing
+a group's first frame until it can be shown, the network left out.
 """
 
 from __future__ import annotations
@@ -12,9 +16,11 @@ import os
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
@@ -34,6 +40,7 @@ LEVELS = (0.0, 25.0, 50.0, 100.0)
 SEQUENCE_S = 20.0
 CAPTURED_S = 20.0  # whatever is measured of it, so that it is captured once; motions repeat
 LOOKED_AT_EVERY = 7  # frames: what is compared; bytes are of all
+VIDEO_FRAMES = 8  # of a group
 POINT_BYTES = 15  # three float32 and a colour
 # Means over the four motions of L Tables 1 and 2, by level; ratios of 0 % count the model once in 28 to 240 s.
 PAPER_PSNR_DB = {0.0: 25.0, 25.0: 27.2, 100.0: 29.2}
@@ -44,7 +51,7 @@ PAPER_RIVALS = {"yang": 11.9, "h264": 49.9}
 def add_options(parser: argparse.ArgumentParser) -> None:
     """This bench's own options."""
     parser.add_argument("--cameras", default="4,8", help="how many, separated by commas")
-    parser.add_argument("--methods", default="", help="residual, previous, a rival, or a rival/level; all")
+    parser.add_argument("--methods", default="", help=f"{', '.join(OURS)}, a rival, or a rival/level; all")
     parser.add_argument("--levels", default="", help="levels [%%] of residuals, separated by commas")
     parser.add_argument("--captures", type=Path, help="folder where captured motions are kept for the next time")
 
@@ -58,10 +65,10 @@ def run(
     wanted = [float(word) for word in levels.split(",") if word] or LEVELS
     for case, sequence in _sequences(data, seconds or SEQUENCE_S, clips, cameras, kept):
         chosen = [word for word in methods.split(",") if word]
-        for method in ("residual", "previous"):
+        for method, measure in OURS.items():
             if not chosen or method in chosen:
                 for level in wanted:
-                    yield from _rows(f"{case}/{method}/{level:g}", sequence, _residual(sequence, method, level), level)
+                    yield from _rows(f"{case}/{method}/{level:g}", sequence, measure(sequence, level), level)
         for name, make in rivals().items():
             if not chosen or name in chosen or name.partition("/")[0] in chosen:
                 yield from _rows(f"{case}/{name}", sequence, _rival(sequence, make(sequence)), None)
@@ -87,17 +94,20 @@ def _sequences(
 
 @dataclass(slots=True)
 class Measured:
-    """One case: bytes and seconds of every frame coded, likeness of those looked at."""
+    """One case: bytes and seconds of every frame coded, likeness of those looked at. ``late``: likeness with maps that
+    come later than skeletons; ``delay_s``: how much later."""
 
     sizes: list[float] = field(default_factory=list)
     encode_s: list[float] = field(default_factory=list)
     decode_s: list[float] = field(default_factory=list)
     likeness: dict[int, Likeness] = field(default_factory=dict)
+    late: dict[int, Likeness] = field(default_factory=dict)
+    delay_s: list[float] = field(default_factory=list)
 
 
-def _residual(sequence: PosedSequence, method: str, level: float) -> Measured:
-    """Every frame through the residual encoder and decoder; ``method``: "residual" is against the model."""
-    ours = ResidualEncoder(0, 1, ResidualSettings(POINTS, "previous" if method == "previous" else "model"))
+def _residual(sequence: PosedSequence, level: float, reference: Literal["model", "previous"] = "model") -> Measured:
+    """Every frame through the residual encoder and decoder."""
+    ours = ResidualEncoder(0, 1, ResidualSettings(POINTS, reference))
     theirs, out = ResidualDecoder(), Measured()
     for k in range(sequence.length):
         frame = sequence.residual_frame(k)
@@ -115,6 +125,45 @@ def _residual(sequence: PosedSequence, method: str, level: float) -> Measured:
         if k % LOOKED_AT_EVERY == 0:
             out.likeness[k] = sequence.likeness(k, shown)
     return out
+
+
+def _video(sequence: PosedSequence, level: float) -> Measured:
+    """Every frame in a group of ``VIDEO_FRAMES``; what does not fill one at the end is left out."""
+    ours, theirs = ResidualEncoder(0, 1, ResidualSettings(POINTS, video_frames=VIDEO_FRAMES)), ResidualDecoder()
+    out, encode_s = Measured(), 0.0
+    for k in range(sequence.length):
+        frame = sequence.residual_frame(k)
+        begun = time.perf_counter()
+        packet = ours.encode(frame, level)
+        coded = time.perf_counter()
+        encode_s += coded - begun
+        if packet is None:
+            continue
+        found = theirs.decode(packet, {f.body_revision: f.skeleton for f in (sequence.frame(k - 1), sequence.frame(k))})
+        decoded = time.perf_counter()
+        for maps in found:
+            at = maps.header.skeleton_sequence
+            shown_begun = time.perf_counter()
+            shown = cloud(maps, sequence.frame(at).T_world_link)
+            out.decode_s.append(time.perf_counter() - shown_begun + (decoded - coded) / len(found))
+            out.encode_s.append(encode_s / len(found))
+            out.sizes.append(len(packet) / len(found) + SKELETON_PACKET_BYTES)
+            if at % LOOKED_AT_EVERY == 0:
+                out.likeness[at] = sequence.likeness(at, shown)
+                then = at + VIDEO_FRAMES
+                if then < sequence.length and sequence.frame(then).skeleton is maps.skeleton:
+                    out.late[then] = sequence.likeness(then, cloud(maps, sequence.frame(then).T_world_link))
+        out.delay_s.append((len(found) - 1) / FRAME_RATE_HZ + (decoded - begun))
+        encode_s = 0.0
+    return out
+
+
+# Of our own methods, how a level of one is measured.
+OURS: dict[str, Callable[[PosedSequence, float], Measured]] = {
+    "residual": _residual,
+    "previous": partial(_residual, reference="previous"),
+    "residual-video": _video,
+}
 
 
 def _rival(sequence: PosedSequence, encode: Encode) -> Measured:
@@ -149,6 +198,11 @@ def _rows(case: str, sequence: PosedSequence, measured: Measured, level: float |
         "encode_ms": (1e3 * float(np.median(measured.encode_s)), "ms", None, "median"),
         "decode_ms": (1e3 * float(np.median(measured.decode_s)), "ms", None, "median"),
     }
+    if measured.delay_s:
+        about = f"{VIDEO_FRAMES - 1} frames to fill a group, to encode and decode it"
+        figures["added_delay_ms"] = (1e3 * float(np.median(measured.delay_s)), "ms", None, about)
+        late_db = [seen.psnr_db for seen in measured.late.values()]
+        figures["psnr_late_db"] = (float(np.mean(late_db)), "dB", None, f"maps {VIDEO_FRAMES} frames after skeletons")
     told = "  ".join(f"{name} {value:.4g}" for name, (value, *_) in figures.items())
     print(f"\r{case}: {told}", file=sys.stderr, flush=True)
     return [

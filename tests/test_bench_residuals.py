@@ -10,7 +10,7 @@ import pytest
 
 from common.body.skeleton_pose import forward_kinematics
 from common.geometry.point_cloud import PointCloud
-from scripts.bench_residuals import LOOKED_AT_EVERY, POINT_BYTES, _residual, _rival, _rows
+from scripts.bench_residuals import LOOKED_AT_EVERY, POINT_BYTES, _residual, _rival, _rows, _video
 from scripts.residual_figures import frames_chart, rate_chart, residual_clouds
 from scripts.residual_quality import likeness
 from scripts.residual_rivals import filmed, rivals
@@ -44,11 +44,23 @@ def test_a_cloud_is_like_itself_and_less_so_the_more_it_is_moved() -> None:
 
 
 def test_residuals_bring_more_the_more_of_them_there_are() -> None:
-    measured = [_residual(short_sequence(), "residual", level) for level in (0.0, 25.0, 100.0)]
+    measured = [_residual(short_sequence(), level) for level in (0.0, 25.0, 100.0)]
     sizes = [np.mean(m.sizes) for m in measured]
     last_db = [m.likeness[LOOKED_AT_EVERY].psnr_db for m in measured]
     assert sizes[0] < sizes[1] < sizes[2]
     assert last_db[0] < last_db[1] < last_db[2]
+
+
+def test_maps_as_video_take_less_and_say_what_they_are_late() -> None:
+    pytest.importorskip("av")
+    sequence = short_sequence(3 * LOOKED_AT_EVERY)
+    measured, alone = _video(sequence, 50.0), _residual(sequence, 50.0)
+    assert len(measured.sizes) == 16  # two whole groups
+    assert np.mean(measured.sizes) < np.mean(alone.sizes)
+    assert measured.likeness[LOOKED_AT_EVERY].psnr_db > alone.likeness[LOOKED_AT_EVERY].psnr_db - 3
+    figures = {r["metric"]: r["value"] for r in _rows("capsules/arms/4/residual-video/50", sequence, measured, 50.0)}
+    assert figures["added_delay_ms"] > 7e3 / 30
+    assert figures["psnr_late_db"] < figures["psnr_db"] + 1
 
 
 @pytest.mark.parametrize("name", [n for n in rivals() if n.split("/")[0] in ("yang", "rvl", "draco")])
@@ -72,7 +84,7 @@ def test_video_shows_the_person_better_at_a_higher_rate(name: str) -> None:
 
 def test_ratios_are_to_the_images_and_to_the_points() -> None:
     sequence = short_sequence()
-    measured = _residual(sequence, "residual", 50.0)
+    measured = _residual(sequence, 50.0)
     figures = {row["metric"]: row["value"] for row in _rows("capsules/arms/4/residual/50", sequence, measured, 50.0)}
     size = np.mean(measured.sizes)
     assert figures["bytes_per_frame"] == pytest.approx(size)
