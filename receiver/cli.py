@@ -14,8 +14,8 @@ from urllib.parse import urlsplit
 from common.runtime.config_file import SettingsError, load_settings
 from common.runtime.daemon import leave, run_daemon, set_up_logging
 from common.runtime.daemon_options import add_daemon_options, overrides
+from common.runtime.garbage import collect_later
 from common.runtime.threads import prepare_threads
-from receiver.config import ReceiverSettings
 
 EXPORT_SUFFIXES = (".glb", ".ply")
 EXAMPLES = """examples:
@@ -202,6 +202,7 @@ def run_decode(arguments: list[str]) -> int:
     set_up_logging("INFO" if options.page else "WARNING")
     prepare_threads()
     given = {key: value for key, value in vars(options).items() if "." in key and value is not None}
+    from receiver.config import ReceiverSettings  # NumPy: not before threads are prepared
     from receiver.decode import DecodeError, DecodeOptions, decode  # numba and OpenCV take a second: not for --help
 
     try:
@@ -223,17 +224,19 @@ def main() -> None:
         sys.exit(run_decode(sys.argv[2:]))
     if sys.argv[1:2] == ["export"]:
         return run_export(sys.argv[2:])
+    collect_later()
     options = parse_arguments()
     if vars(options).pop("exit_with_parent"):
         threading.Thread(target=_stop_when_input_ends, name="parent", daemon=True).start()
     set_up_logging(options.log_level)
     prepare_threads()
+    from receiver.config import ReceiverSettings  # NumPy: not before threads are prepared
+    from receiver.daemon import ReceiverDaemon  # Zenoh and what reads certificates: not for --help
+
     try:
         settings = load_settings(ReceiverSettings, options.config, overrides(options))
     except SettingsError as error:
         sys.exit(f"telepose-receive: {error}")
-    from receiver.daemon import ReceiverDaemon  # numba and OpenCV take a second: not for --help or a wrong setting
-
     leave(run_daemon("telepose-receive", ReceiverDaemon(settings).run, options.ready_file))
 
 

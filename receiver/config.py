@@ -6,9 +6,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
-from common.body.body_regions import DEFAULT_WEIGHTS, region_weights
-from common.body.joint_edges import ScoreForm
-from common.runtime.http_access import HttpSettings
+from common.body.body_regions import DEFAULT_WEIGHTS, ScoreForm, region_weights
+from common.runtime.http_settings import HttpSettings
 from common.transport.link_settings import LinkSettings
 
 BLENDED_MAX = 8  # each is drawn twice, thirty times a second

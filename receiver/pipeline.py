@@ -15,9 +15,8 @@ from statistics import median
 import numpy as np
 from numpy.typing import NDArray
 
-from common.body.body_regions import region_weights
+from common.body.body_regions import ScoreForm, region_weights
 from common.body.distortion_score import region_scores
-from common.body.joint_edges import ScoreForm
 from common.body.link_points import LinkPoints
 from common.body.rigged_mesh import RiggedMesh, build_rigged_mesh
 from common.body.skeleton import Skeleton

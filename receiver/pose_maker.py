@@ -9,7 +9,7 @@ from collections import Counter, deque
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 
-from common.body.joint_edges import ScoreForm
+from common.body.body_regions import ScoreForm
 from common.runtime.stage_timer import StageTimer
 from common.runtime.threads import into_background
 from common.wire.header import WireError

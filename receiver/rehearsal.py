@@ -1,4 +1,4 @@
-"""The receiver's whole path once over a mannequin, so that every kernel is there before the first real frame."""
+"""The receiver's path over a mannequin, so that every kernel is there before the first real frame that needs it."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import numpy as np
 
 from common.body.cylindrical_map import LinkMaps
 from common.body.mannequin import mannequin, mannequin_camera, mannequin_depth
+from common.body.rigged_mesh import build_rigged_mesh
 from common.body.rigging import Rigging
 from common.body.skeleton import Skeleton
 from common.body.skeleton_pose import SkeletonPose
@@ -21,23 +22,31 @@ from common.wire.residual_packet import ResidualHeader
 from common.wire.skeleton_packet import SkeletonPacket, decode_skeleton, encode_skeleton
 from receiver.config import RepositorySettings
 from receiver.live_path import FADE_NS
-from receiver.pipeline import AnimationPath, SkeletonToShow, mesh_of
+from receiver.pipeline import AnimationPath, ReceivedPose, SkeletonToShow, mesh_of
 from receiver.residual_decoder import ResidualMaps
 from receiver.viewer.offscreen_viewer import OffscreenViewer
 from receiver.viewer.page_messages import encode_frame, encode_pose
 
+_RIGGING = Rigging("region-growing", "zippered")  # whatever a sender chooses
+
+
+def rehearse_picture() -> None:
+    """What the first picture waits for: mesh a candidate pose, select and animate it."""
+    skeleton, pose = mannequin()
+    view = _view()
+    mesh = build_rigged_mesh(0, 0, skeleton, pose, (view, view), _RIGGING, "all-edges")
+    arrived = deque(
+        ReceivedPose(0, replace(mesh, pose_id=number)) for number in range(2)
+    )  # they meet in the repository
+    _animation_path().show(SkeletonToShow(SkeletonPacket(0, 0, 0, 0, 0, 1.0, pose), skeleton, arrived))
+
 
 def rehearse() -> None:
-    """Mesh a candidate pose, select and animate it, let it follow residual maps, and show it both ways."""
+    """The whole path: mesh a message, select and animate it, let it follow residual maps, and show it both ways."""
     skeleton, pose = mannequin()
-    camera = mannequin_camera()
-    depth = mannequin_depth(camera)
-    view = View(camera, 0, 0, depth, np.full((*depth.shape, 3), 128, np.uint8))
-    rigging = Rigging("region-growing", "zippered")  # whatever a sender chooses
-    message = encode_candidate_pose(CandidatePose(1, 0, 0, 0, skeleton, pose, (view, view), rigging))
+    view, path = _view(), _animation_path()
+    message = encode_candidate_pose(CandidatePose(1, 0, 0, 0, skeleton, pose, (view, view), _RIGGING))
     packet = decode_skeleton(encode_skeleton(SkeletonPacket(0, 0, 0, 0, 0, 1.0, pose)))
-    clock = MonotonicClock()
-    path = AnimationPath(RepositorySettings(), StageTimer(clock), clock)
     viewer = OffscreenViewer(mode="live")
     path.live.note_maps(_maps(skeleton, pose))
     for _ in range(2):  # the second pose meets the first in the repository
@@ -49,7 +58,18 @@ def rehearse() -> None:
         if shown.frame is not None:
             viewer.show(shown.frame)
             encode_frame(shown.frame)
-    viewer.render([camera])
+    viewer.render([view.camera])
+
+
+def _animation_path() -> AnimationPath:
+    clock = MonotonicClock()
+    return AnimationPath(RepositorySettings(), StageTimer(clock), clock)
+
+
+def _view() -> View:
+    camera = mannequin_camera()
+    depth = mannequin_depth(camera)
+    return View(camera, 0, 0, depth, np.full((*depth.shape, 3), 128, np.uint8))
 
 
 def _maps(skeleton: Skeleton, pose: SkeletonPose) -> ResidualMaps:

@@ -16,8 +16,8 @@ from typing import get_args
 from common.body.link_points import LinkPoints
 from common.runtime.clock import MonotonicClock
 from common.runtime.daemon import Daemon, DaemonError
-from common.runtime.http_access import read_token, tls_context
-from common.runtime.metrics import Health, Metrics, daemon_app, serve_app
+from common.runtime.http_app import served
+from common.runtime.metrics import Health, Metrics
 from common.runtime.session_recording import RecordingError, SessionReader
 from common.transport.channels import SCHEMA
 from receiver.config import ReceiverSettings
@@ -65,13 +65,9 @@ class SessionPage:
         Raises:
             DaemonError: the session cannot be played, or the port not be had.
         """
-        http = self._settings.http
-        app = daemon_app(Metrics(), Health(ready=True, reason="playing"), read_token(http))
-        tls = tls_context(http)
-        self._viewer.add_routes(app)
+        health = Health(ready=True, reason="playing")
         try:
-            async with serve_app(app, http.host, http.port, tls) as port:
-                log.info("the page on %s://%s:%d/", "https" if tls else "http", http.host, port)
+            async with served(self._settings.http, Metrics(), health, "the page", self._viewer.add_routes):
                 daemon.announce_ready()
                 told = False
                 while not (told and self._once):

@@ -17,13 +17,13 @@ from pathlib import Path
 from statistics import median
 
 from scripts.link_model import BurstLoss, LinkConditions
-from scripts.network_emulation import unavailable
+from scripts.network_emulation import EmulatorReport, unavailable
 from scripts.network_run import MS, NS, Change, NetworkCase, Seen, percentile, run_case
 from scripts.run_bench import Row
 
 VOID_RUNS_MAX = 3
 OUTAGE_S = 5.0
-HERE = "two processes, user-space emulator"
+HERE = "two processes"
 Figures = dict[str, tuple[float, str]]  # metric → value, unit
 Judge = Callable[[NetworkCase, Seen], Figures]
 
@@ -184,30 +184,28 @@ def run(data: Path | None, seconds: float | None, clips: tuple[str, ...], runs: 
 
 def _case(name: str, case: NetworkCase, judge: Judge, runs: int) -> Iterator[Row]:
     found: list[Figures] = []
-    late_ms: list[float] = []
+    latest: EmulatorReport | None = None
     void = 0
     while len(found) < runs and void < VOID_RUNS_MAX:
         with tempfile.TemporaryDirectory(prefix="telepose-network-") as folder:
             seen = run_case(case, Path(folder))
         figures = judge(case, seen)
         shown = ", ".join(f"{metric} {value:.4g}" for metric, (value, _) in figures.items())
-        late = seen.emulator.late_p99_ms
         verdict = "void" if seen.emulator.void else "run"
-        print(f"network: {name} {verdict}, emulator late {late:.2f} ms: {shown}", file=sys.stderr, flush=True)
+        print(f"network: {name} {verdict}, {seen.emulator.about}: {shown}", file=sys.stderr, flush=True)
         if seen.emulator.void:
             void += 1
             continue
         found.append(figures)
-        late_ms.append(late)
-    source = f"{HERE}, {len(found)} runs" + (f", {void} void" if void else "")
+        latest = max((latest, seen.emulator), key=lambda report: report.late_p99_ms) if latest else seen.emulator
+    how = f", {latest.about}" if latest else ""
+    source = f"{HERE}{how}, {len(found)} runs" + (f", {void} void" if void else "")
     if not found:
         yield Row(case=name, metric="void", value=None, unit="", reference=None, source=source)
         return
     for metric, (_, unit) in found[0].items():
         value = median(figures[metric][0] for figures in found)
         yield Row(case=name, metric=metric, value=value, unit=unit, reference=GOALS.get((name, metric)), source=source)
-    late = max(late_ms)
-    yield Row(case=name, metric="emulator_late_p99_ms", value=late, unit="ms", reference=None, source=source)
 
 
 _P50, _P99 = "skeleton_delay_over_idle_p50_ms", "skeleton_delay_over_idle_p99_ms"

@@ -71,10 +71,10 @@ def run(
         with soak.sampling():
             for fault in plan(seed, seconds or minutes * 60):
                 soak.suffer(fault)
-        late_ms = here.network.report().late_p99_ms
+        emulator = here.network.report().about
     if chart is not None:
         chart.write_text(soak.chart())
-    source = f"seed {seed}, {(seconds or minutes * 60) / 60:.1f} min, emulator late by {late_ms:.2f} ms at p99"
+    source = f"seed {seed}, {(seconds or minutes * 60) / 60:.1f} min, {emulator}"
     for case, metric, value, unit, reference in soak.figures():
         yield Row(case=case, metric=metric, value=value, unit=unit, reference=reference, source=source)
 

@@ -131,7 +131,7 @@ def _serve(network: EmulatedNetwork) -> None:
                     _conditions(changes, direction)  # what is impossible is said here
                 for direction, values in changes.items():
                     network.change(direction, **values)
-        except ConditionError as error:
+        except (ConditionError, EmulationError) as error:
             print(error, file=sys.stderr, flush=True)
 
 
@@ -146,12 +146,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("conditions", nargs="*", metavar="NAME=VALUE", help="what the path is like at first")
     parser.add_argument("--mtu", type=int, default=1500, help="longest packet, in bytes (default 1500)")
     parser.add_argument("--congestion-control", choices=("reno", "bbr", "cubic"), help="of TCP inside (this host's)")
+    parser.add_argument(
+        "--emulator", choices=("auto", "netem", "own"), default="auto", help="netem: the kernel's; auto: if it has one"
+    )
     options = parser.parse_args(arguments)
+    emulator = None if options.emulator == "auto" else options.emulator
     try:
         changes = parse_words(options.conditions)
         there, back = _conditions(changes, "there"), _conditions(changes, "back")
-        with emulated_network(there, back, options.mtu, options.congestion_control) as network:
-            print("A is 198.18.0.1 and B is 198.18.0.2. To be in one of them:")
+        with emulated_network(there, back, options.mtu, options.congestion_control, emulator) as network:
+            print(f"A is 198.18.0.1 and B is 198.18.0.2, emulator: {network.emulator}. To be in one of them:")
             for side in ("A", "B"):
                 print(f"  {side}:  {' '.join(network.command(side, ['bash']))}")
             print("Now type changes, or report; the end of input ends it." + ("" if network.punctual else _UNPUNCTUAL))

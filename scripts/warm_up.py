@@ -8,14 +8,12 @@ from receiver.rehearsal import rehearse
 from sender.capture.performer import open_performer
 from sender.capture.rig_layout import RigSettings
 from sender.capture.rig_process import RigRenderer
-from sender.rehearsal import rehearse_all, rehearse_particles, rehearse_restart
+from sender.rehearsal import rehearse_all
 
 
 def main() -> None:
     """Both daemons' rehearsals, and one picture of the virtual rig."""
     rehearse_all()
-    rehearse_restart()
-    rehearse_particles()
     rehearse()
     renderer = RigRenderer(open_performer("builtin"), RigSettings(cameras=1))
     renderer.view(0, 2.5, np.zeros((480, 640), np.uint16), np.zeros((480, 640, 3), np.uint8))

@@ -9,8 +9,8 @@ from pathlib import Path
 from common.runtime.config_file import SettingsError, load_settings
 from common.runtime.daemon import leave, run_daemon, set_up_logging
 from common.runtime.daemon_options import add_daemon_options, overrides
+from common.runtime.garbage import collect_later
 from common.runtime.threads import prepare_threads
-from sender.config import SenderSettings
 
 EXAMPLES = """examples:
   telepose-send                                       the built-in performer before four virtual cameras
@@ -149,6 +149,7 @@ def run_encode(arguments: list[str]) -> int:
     given = {key: value for key, value in options.items() if key != "config" and value is not None}
     set_up_logging("WARNING")
     prepare_threads()
+    from sender.config import SenderSettings  # NumPy: not before threads are prepared
     from sender.encode import EncodeError, EncodeOptions, encode  # numba and OpenCV take a second: not for --help
 
     try:
@@ -169,13 +170,15 @@ def main() -> None:
     """Entry point of the console script."""
     if sys.argv[1:2] == ["encode"]:
         sys.exit(run_encode(sys.argv[2:]))
+    collect_later()
     options = parse_arguments()
     set_up_logging(options.log_level)
     prepare_threads()
+    from sender.config import SenderSettings  # NumPy: not before threads are prepared
+    from sender.daemon import SenderDaemon  # Zenoh and what reads certificates: not for --help
+
     try:
         settings = load_settings(SenderSettings, options.config, source_of(overrides(options)))
     except SettingsError as error:
         sys.exit(f"telepose-send: {error}")
-    from sender.daemon import SenderDaemon  # numba and OpenCV take a second: not for --help or a wrong setting
-
     leave(run_daemon("telepose-send", SenderDaemon(settings).run, options.ready_file))

@@ -6,10 +6,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
-from common.body.body_regions import DEFAULT_WEIGHTS, region_weights
-from common.body.joint_edges import ScoreForm
+from common.body.body_regions import DEFAULT_WEIGHTS, ScoreForm, region_weights
 from common.body.rigging import Segmentation, Views
-from common.runtime.http_access import HttpSettings
+from common.runtime.http_settings import HttpSettings
 from common.transport.channels import check_name
 from common.transport.link_settings import LinkSettings
 

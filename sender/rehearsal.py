@@ -147,19 +147,21 @@ def rehearse_skeletons() -> None:
         tracker.track((OutsideSkeleton(index * FRAME_NS, 0, joints, np.ones(len(joints), np.float32)),))
 
 
-def rehearse_slow_paths() -> None:
-    """What goes on beside the skeletons."""
-    rehearse_candidates()
-    rehearse_residuals()
-
-
-def rehearse_all() -> None:
-    """What a sender does from the first frame on."""
+def rehearse_start() -> None:
+    """What a sender does from the first frame on, until it has found a person, and when it has lost them."""
     rehearse_fitting()
     rehearse_recovery()
     rehearse_skeletons()
     rehearse_hull()
-    rehearse_slow_paths()
+
+
+def rehearse_all() -> None:
+    """What any sender may do."""
+    rehearse_start()
+    rehearse_restart()
+    rehearse_particles()
+    rehearse_candidates()
+    rehearse_residuals()
 
 
 def _view(camera: Camera) -> View:

@@ -7,7 +7,6 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from common.body.body_regions import vertex_regions
 from common.body.joint_edges import joint_edges
 from common.body.link_points import LinkPoints
 from common.body.rigged_mesh import RiggedMesh
@@ -15,6 +14,7 @@ from common.body.skeleton import LINK_COUNT, LINK_INDEX, Skeleton, human_skeleto
 from common.body.skeleton_pose import SkeletonPose, bone_segments, forward_kinematics, joint_positions, rest_pose
 from common.body.skinning import link_motion
 from common.body.vertex_blend import vertex_blend
+from common.body.vertex_regions import vertex_regions
 from common.geometry.rigid_transform import inverse
 from common.geometry.triangle_mesh import TriangleMesh
 from receiver.viewer.viewer import ShownFrame

@@ -12,9 +12,9 @@ from common.body.body_regions import (
     REGION_NAMES,
     default_region_weights,
     region_weights,
-    vertex_regions,
 )
 from common.body.skeleton import LINK_COUNT, LINK_INDEX, LINK_NAMES
+from common.body.vertex_regions import vertex_regions
 from common.geometry.rigid_transform import inverse
 from tests.capsule_person import SKELETON
 from tests.capsule_views import arms_down_by, captured, links_of

@@ -13,7 +13,6 @@ from common.body.body_regions import (
     REGION_LINKS,
     REGION_NAMES,
     default_region_weights,
-    vertex_regions,
 )
 from common.body.distortion_score import (
     START_THRESHOLD,
@@ -26,6 +25,7 @@ from common.body.joint_edges import joint_edges
 from common.body.rigged_mesh import RiggedMesh
 from common.body.skeleton_pose import SkeletonPose
 from common.body.skinning import animate, link_motion
+from common.body.vertex_regions import vertex_regions
 from tests.capsule_person import SKELETON
 from tests.capsule_views import arms_down_by, captured, links_of
 

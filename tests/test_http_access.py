@@ -13,8 +13,10 @@ import pytest
 
 from common.runtime.config_file import SettingsError, load_settings
 from common.runtime.daemon import DaemonError
-from common.runtime.http_access import COOKIE, HttpSettings, is_loopback, read_token, tls_context
-from common.runtime.metrics import Health, Metrics, daemon_app, serve_app
+from common.runtime.http_access import COOKIE, read_token, tls_context
+from common.runtime.http_app import daemon_app, serve_app
+from common.runtime.http_settings import HttpSettings, is_loopback
+from common.runtime.metrics import Health, Metrics
 from receiver.config import ReceiverSettings
 from receiver.viewer.web_viewer import WebViewer
 from scripts.make_certificates import make

@@ -11,7 +11,8 @@ from aiohttp import web
 
 from common.runtime.clock import ManualClock
 from common.runtime.daemon import DaemonError
-from common.runtime.metrics import Health, Metrics, daemon_app, serve_app
+from common.runtime.http_app import daemon_app, serve_app
+from common.runtime.metrics import Health, Metrics
 from common.runtime.stage_timer import StageTimer
 
 

@@ -14,9 +14,10 @@ from pathlib import Path
 
 import pytest
 
+from scripts import netem, network_emulation
 from scripts.bench_network import CASES, outage, steady
 from scripts.link_model import LinkConditions
-from scripts.network_emulation import EmulatedNetwork, emulated_network, unavailable
+from scripts.network_emulation import EmulatedNetwork, OwnNetwork, emulated_network, unavailable
 from scripts.network_run import NS, Change, NetworkCase, Seen, probes, run_case
 
 WHY_NOT = unavailable()
@@ -73,7 +74,8 @@ def test_a_path_has_the_rate_it_is_given_and_leaves_nothing_behind() -> None:
 
 
 def test_namespaces_vanish_even_when_the_emulator_is_killed() -> None:
-    with emulated_network(LinkConditions()) as network:
+    with emulated_network(LinkConditions(), emulator="own") as network:
+        assert isinstance(network, OwnNetwork)
         holders = [int(network.command(side, [])[1].split("/")[2]) for side in ("A", "B")]
         network._process.send_signal(signal.SIGKILL)
         network._process.wait()
@@ -81,6 +83,26 @@ def test_namespaces_vanish_even_when_the_emulator_is_killed() -> None:
         while any(Path(f"/proc/{holder}").exists() for holder in holders):
             assert time.monotonic() < deadline
             time.sleep(0.01)
+
+
+def test_a_path_of_the_kernel_s_own_has_its_two_ends_and_what_tc_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without netem itself, where the kernel has none: its rate alone."""
+    if not netem.kernel_knows_netem():
+        monkeypatch.setattr(network_emulation, "qdiscs", lambda path: [(netem.ROOT, netem.tbf_arguments(path))])
+    with emulated_network(LinkConditions(rate_bps=4e6), emulator="netem") as network:
+        fast_s = transfer_s(network, 250_000)  # 0.5 s at the rate
+        network.change("there", rate_bps=2e6)
+        slow_s = transfer_s(network, 250_000)
+        report = network.report()
+        holders = [network.command(side, [])[1].split("/")[2] for side in ("A", "B")]
+    assert 0.4 <= fast_s < slow_s
+    assert slow_s >= 0.9
+    assert 500_000 < report.there["bytes"] < 600_000
+    assert report.there["packets"] > 500_000 / 1500
+    assert report.back["packets"] > 100
+    assert report.about == "netem"
+    assert not report.void
+    assert not any(Path(f"/proc/{holder}").exists() for holder in holders)
 
 
 def test_skeletons_wait_little_beside_endless_meshes(tmp_path: Path) -> None:

@@ -17,7 +17,7 @@ import pytest
 
 from common.geometry.rasterizer import render
 from common.runtime.daemon import Daemon
-from common.runtime.http_access import HttpSettings
+from common.runtime.http_settings import HttpSettings
 from common.runtime.session_recording import SessionReader, SessionWriter, StoredMessage
 from common.transport.channels import CHANNELS
 from common.transport.chunks import ChunkAssembler, decode_chunk

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from common.body.mannequin import mannequin, mannequin_camera, mannequin_depth
 from common.body.skeleton_pose import joint_positions
@@ -69,7 +70,8 @@ def test_residual_maps_are_rehearsed_as_key_and_difference(monkeypatch):
     assert [(residual.sequence, residual.key) for residual in found] == [(0, 0), (1, 0)]
 
 
-def test_the_receivers_rehearsal_shows_a_mesh(monkeypatch):
+@pytest.mark.parametrize(("rehearse", "pose_ids"), [("rehearse", [1, 1]), ("rehearse_picture", [1])])
+def test_the_receivers_rehearsals_show_a_mesh(monkeypatch, rehearse, pose_ids):
     shown = []
     show = receiving.AnimationPath.show
 
@@ -78,8 +80,8 @@ def test_the_receivers_rehearsal_shows_a_mesh(monkeypatch):
         return shown[-1]
 
     monkeypatch.setattr(receiving.AnimationPath, "show", watched)
-    receiving.rehearse()
-    assert all(result.frame is not None and result.frame.pose_id == 1 for result in shown)
+    getattr(receiving, rehearse)()
+    assert [result.frame.pose_id for result in shown] == pose_ids
 
 
 def test_what_a_session_meets_late_is_rehearsed_too():

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from common.body.body_regions import REGION_INDEX, REGION_LINKS, vertex_regions
+from common.body.body_regions import REGION_INDEX, REGION_LINKS
 from common.body.depth_mesher import mesh_view
 from common.body.joint_edges import FIXED_EDGE_M, joint_edges
 from common.body.rigged_mesh import (
@@ -16,6 +16,7 @@ from common.body.rigged_mesh import (
 )
 from common.body.skeleton import LINK_COUNT, LINK_INDEX, LINK_PARENTS
 from common.body.skinning import animate, link_motion
+from common.body.vertex_regions import vertex_regions
 from common.body.view import View
 from common.geometry.rigid_transform import transform_points
 from tests.capsule_person import SKELETON

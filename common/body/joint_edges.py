@@ -3,18 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from common.body.body_regions import REGION_COUNT, REGION_LINKS
+from common.body.body_regions import REGION_COUNT, REGION_LINKS, ScoreForm
 
-# What Eq. (1) divides the change of a region's edges by: their own length, as printed; that of all the region's edges,
-# those within it too; or their number times a fixed length. The first grows as edges get shorter, and the paper's
-# threshold of 0.15 belongs to it on meshes like the paper's; the last means the same on coarse meshes and fine ones.
-ScoreForm = Literal["joining-edges", "all-edges", "fixed-length"]
 FIXED_EDGE_M = 0.05
 
 

@@ -12,15 +12,16 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from common.body.body_regions import vertex_regions
+from common.body.body_regions import ScoreForm
 from common.body.depth_mesher import mesh_view
-from common.body.joint_edges import JointEdges, ScoreForm, joint_edges
+from common.body.joint_edges import JointEdges, joint_edges
 from common.body.link_segmentation import nearest_link
 from common.body.region_growing import grown_regions
 from common.body.rigging import DEFAULT_RIGGING, Rigging
 from common.body.skeleton import LINK_COUNT, LINK_PARENTS, Skeleton
 from common.body.skeleton_pose import SkeletonPose, forward_kinematics
 from common.body.vertex_blend import VertexBlend, vertex_blend
+from common.body.vertex_regions import vertex_regions
 from common.body.view import View
 from common.body.zipper import zippered
 from common.geometry.rigid_transform import inverse

@@ -23,8 +23,8 @@ class ComputeWorker(Generic[Input, Output]):
 
     Its life is the coroutine ``run``: put it into a task group. ``run`` starts the thread, calls ``warm_up`` there
     (compiling kernels, say), and raises what ``job`` or ``warm_up`` raised; cancelling it stops the thread.
-    ``background``: it gives way to whatever else this machine has to do. At most one input
-    waits, and at most one result is on its way to the loop.
+    ``background``: after its first job it gives way to whatever else this machine has to do. At most one input waits,
+    and at most one result is on its way to the loop.
     """
 
     def __init__(
@@ -84,13 +84,13 @@ class ComputeWorker(Generic[Input, Output]):
     def _work(self, loop: asyncio.AbstractEventLoop, ended: asyncio.Future[BaseException | None]) -> None:
         failure: BaseException | None = None
         try:
-            if self._background:
-                into_background()
             if self._warm_up is not None:
                 self._warm_up()
             loop.call_soon_threadsafe(self._ready.set)
             while True:
                 result = self._job(self._inputs.wait())
+                if self._background:  # from the second on: for the first somebody waits
+                    into_background()
                 self._loop_is_free.wait()
                 self._loop_is_free.clear()
                 loop.call_soon_threadsafe(self._hand_over, result, ended)

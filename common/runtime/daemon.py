@@ -25,6 +25,8 @@ from typing import Any
 
 import uvloop
 
+from common.runtime.garbage import collect_from_now_on
+
 log = logging.getLogger(__name__)
 
 STOP_WITHIN_S = 1.8  # from the first signal, or the end of the main coroutine, to the end of the process
@@ -45,7 +47,8 @@ class Daemon:
         self._ready_file = ready_file
 
     def announce_ready(self) -> None:
-        """Say once that the daemon does its job: a log line, the readiness file, and systemd."""
+        """Say once that the daemon does its job: a log line, the readiness file, and systemd. Its start is over."""
+        collect_from_now_on()
         if self._ready_file is not None:
             unfinished = self._ready_file.with_name(self._ready_file.name + ".part")
             unfinished.write_text(f"{os.getpid()}\n", "ascii")

@@ -16,16 +16,18 @@ from collections.abc import AsyncIterator, Callable, Iterable
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from typing import Any, Generic, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 import zenoh
 from zenoh.handlers import Callback
 
 from common.runtime.daemon import DaemonError
-from common.runtime.metrics import Metrics
 from common.transport.access_rules import Allowance, access_control
 from common.transport.link_settings import LinkSettings, zenoh_locators
 from common.transport.site_certificate import SiteCertificate, load_site_certificate
+
+if TYPE_CHECKING:
+    from common.runtime.metrics import Metrics
 
 log = logging.getLogger(__name__)
 

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import scipy.io
 from numpy.typing import NDArray
 
 from common.geometry.camera_model import Camera
@@ -100,6 +99,8 @@ def _first(folder: Path) -> Path:
 
 
 def _read(file: Path, variable: str) -> NDArray[Any]:
+    import scipy.io  # takes a while: nobody waits for it who plays no such recording
+
     try:
         content = scipy.io.loadmat(file, variable_names=[variable])
     except Exception as error:  # the reader raises whatever the bytes lead it to

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -72,11 +72,11 @@ def _standing_apart(points: Floats) -> Mask | NoPose:
     cells = np.floor((points[:, [0, 2]] - points[:, [0, 2]].min(axis=0)) / APART_CELL_M).astype(np.int64)
     if cells.max() > 200:
         return NoPose(f"the cloud is {cells.max() * APART_CELL_M:.0f} m wide: not one person")
-    ground = np.zeros(cells.max(axis=0) + 1, np.bool_)
-    ground[cells[:, 0], cells[:, 1]] = True
-    labels, count = ndimage.label(ground, np.ones((3, 3)))
+    ground = np.zeros(cells.max(axis=0) + 1, np.uint8)
+    ground[cells[:, 0], cells[:, 1]] = 1
+    count, labels = cv2.connectedComponents(ground, connectivity=8)
     label = labels[cells[:, 0], cells[:, 1]]
-    sizes = np.bincount(label, minlength=count + 1)
+    sizes = np.bincount(label, minlength=count)
     largest = int(np.argmax(sizes))
     for other in np.flatnonzero(sizes > SECOND_SHARE * len(points)):
         if other != largest and np.ptp(points[label == other, 1]) > SECOND_HEIGHT_M:

@@ -10,7 +10,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.ndimage
 from numpy.typing import NDArray
 
 from common.geometry.camera_model import Camera
@@ -84,6 +83,8 @@ class PersonFollower:
 def connected_volumes(positions: Floats) -> NDArray[np.int32]:
     """Volume (N,) int32 of each point (N, 3) [m]: 0, 1, … by size, −1 for splinters. Points are connected through
     cells of ``CELL_M`` that touch."""
+    import scipy.ndimage  # takes a while: nobody waits for it who has depth cameras
+
     if len(positions) == 0:
         return np.zeros(0, np.int32)
     cells = ((positions - positions.min(axis=0)) / CELL_M).astype(np.int64)
