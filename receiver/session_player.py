@@ -22,6 +22,7 @@ from receiver.pipeline import AnimationPath, MapPath, NewMaps, ReceivedPose, Sho
 from receiver.viewer.viewer import Viewer, ViewMode
 
 MESHES_WAITING = 8  # for the next skeleton, as in the daemon
+MAPS_WAITING = 64  # of groups, for the skeletons of their frames
 SILENCE_NS = 10_000_000_000  # a gap between two messages that is longer is not played
 
 
@@ -41,14 +42,15 @@ class SessionPlayer:
         self._animation = AnimationPath(settings, timer, clock)
         self._maps = MapPath(person, timer)
         self._modes = modes
-        self._waiting: deque[tuple[int, NewMaps]] = deque()  # and when they are due
+        self._waiting: deque[tuple[int, NewMaps]] = deque(maxlen=MAPS_WAITING)  # with the capture time they are due at
+        self._shown_ns = 0  # capture time of the skeleton shown
         self._arrived: deque[ReceivedPose] = deque(maxlen=MESHES_WAITING)
 
     def take(self, message: StoredMessage) -> list[Shown | LinkPoints]:
-        """Take in the next message; what a skeleton leads to, and the maps that are due by then. What is malformed is
+        """Take in the next message; what a skeleton leads to, and the maps that are due with it. What is malformed is
         counted and changes nothing."""
         shown, points = self._take(message), None
-        while self._waiting and self._waiting[0][0] <= message.time_ns:
+        while self._waiting and self._waiting[0][0] <= self._shown_ns:
             new = self._waiting.popleft()[1]
             points = new.points
             if "live" in self._modes:
@@ -78,25 +80,29 @@ class SessionPlayer:
             self.counts["skeleton not shown"] += 1
             return None
         self.counts["shown"] += 1
+        self._shown_ns = newest.packet.capture_ns
         return self._animation.show(SkeletonToShow(newest.packet, newest.body, self._arrived))
 
     def _take_chunk(self, message: StoredMessage) -> None:
         whole = self._stream.chunk(decode_chunk(message.payload))
         if whole is not None and is_residual(whole):
             self.counts["residuals"] += 1
-            self._take_residual(whole, message.time_ns)
+            self._take_residual(whole)
         elif whole is not None:
             self.counts["pose waiting too long"] += len(self._arrived) == MESHES_WAITING
             self._arrived.append(mesh_of(whole, self._person, self._settings.score_form))
             self.counts["poses"] += 1
 
-    def _take_residual(self, packet: bytes, now_ns: int) -> None:
-        """Maps wait until they are due: a group's at the pace at which they were captured."""
+    def _take_residual(self, packet: bytes) -> None:
+        """Maps are due with the skeletons of their own frames; those that come later, so much later."""
         live, points = "live" in self._modes, "points" in self._modes
         found = self._maps.take(packet, self._stream.bodies, points) if live or points else []
-        if found:
-            behind_ns = now_ns - found[0].maps.header.capture_ns
-            self._waiting = deque((new.maps.header.capture_ns + behind_ns, new) for new in found)
+        late_ns = max(self._shown_ns - found[0].maps.header.capture_ns, 0) if found else 0
+        for new in found:
+            due_ns = new.maps.header.capture_ns + late_ns
+            while self._waiting and self._waiting[-1][0] >= due_ns:
+                self._waiting.pop()
+            self._waiting.append((due_ns, new))
 
 
 def channel_of(key: str, person: int) -> str:

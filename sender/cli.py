@@ -25,7 +25,7 @@ ENCODE_EXAMPLES = """examples:
   telepose-send encode recordings/monday monday.mcap             what a link of 4 Mbit/s would carry
   telepose-send encode recordings/monday thin.mcap --mbit 0.5    a smaller file: fewer and coarser meshes
   telepose-send encode DIR skeletons.mcap --no-poses --no-residuals    skeletons alone: 7.5 KB/s
-  telepose-send encode DIR video.mcap --residual-video 8         finer residual maps for the bytes, 0.27 s late
+  telepose-send encode DIR video.mcap --residual-video 8         finer residual maps for the bytes
   telepose-receive decode monday.mcap monday.mp4                 and back: as a video (decode --help)
 
 The file holds what would go over the network, as it would at that bandwidth: the same recording and settings give the
@@ -85,9 +85,9 @@ def add_residual_video(parser: argparse.ArgumentParser) -> None:
         dest="residuals.video_frames",
         type=int,
         metavar="N",
-        help="residual maps of N frames as a short video (2 to 30, typically 8; default 0: off): about half the bytes, "
-        "but shown N frames later (8 at 30 fps: 0.27 s) and what the larger packet takes; skeletons are not delayed. "
-        "Needs the video extra, here and where maps are shown",
+        help="residual maps of N frames as a short video (2 to 30, typically 8; default 0: off): about half the bytes; "
+        "live, maps are shown N frames (8 at 30 fps: 0.27 s) and what sending them takes later than skeletons, which "
+        "are not delayed; in a file they are in step. Needs the video extra, here and where maps are shown",
     )
 
 

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
 from common.runtime.clock import MonotonicClock
 from common.runtime.progress import ProgressLine
-from common.runtime.session_recording import RecordingError, SessionWriter
+from common.runtime.session_recording import RecordingError, SessionWriter, StoredMessage
 from common.transport.channels import SCHEMA
 from common.wire.residual_video import VideoUnavailable
 from sender.capture.frame_set import CaptureError
@@ -68,6 +68,7 @@ def _encode(
             _work(encoder, writer, source, options.seconds, settings.capture.patience_ms, clock)
         except KeyboardInterrupt:
             interrupted = True
+        _write(writer, encoder.finish())
         if encoder.amount.skeletons == 0:
             raise EncodeError(f"{options.recording}: nobody was found in {encoder.amount.seconds:.1f} s of it")
         size = writer.finish()
@@ -95,12 +96,16 @@ def _work(
     for frames in frame_sets(source, patience_ms):
         if frames.capture_ns / 1e9 > length_s:
             break
-        for message in encoder.process(frames):
-            writer.add(message.key, message.time_ns, message.payload)
+        _write(writer, encoder.process(frames))
         done_s, passed_s = frames.capture_ns / 1e9, (clock.now_ns() - begin_ns) / 1e9
         speed = done_s / max(passed_s, 1e-3)
         progress.show(done_s / max(length_s, 1e-3), f"{done_s:.1f} of {length_s:.1f} s, {speed:.2f} x real time")
     progress.clear()
+
+
+def _write(writer: SessionWriter, messages: Iterable[StoredMessage]) -> None:
+    for message in messages:
+        writer.add(message.key, message.time_ns, message.payload)
 
 
 def _about(settings: SenderSettings, options: EncodeOptions, source: RecordedRig | RecordedSkeletons) -> dict[str, str]:

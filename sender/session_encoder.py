@@ -2,13 +2,16 @@
 
 What the daemon does live, over a link of a given rate (``PacedBulk``) to one receiver that loses nothing: the file.
 The same recording and settings give the same messages.
+
+Residual maps that go in groups as video come later than skeletons: in a file, where nobody waits, all else is that much
+earlier, so that maps are in step with the skeletons of their own frames.
 """
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from common.runtime.clock import ManualClock
 from common.runtime.session_recording import StoredMessage
@@ -29,6 +32,7 @@ from sender.residual_path import ResidualPath
 
 RECEIVER = "session"  # whom the bulk in the file is addressed to
 EPOCH = 1  # a file holds one run, and the same one whenever it is encoded
+GROUP_AND_SENDING = 2  # a group of maps is complete after N frames, and may take as long to be sent
 RAW_DEPTH_BYTES, RAW_COLOUR_BYTES = 2, 3  # a pixel (Lien §6 counts five)
 
 
@@ -74,9 +78,31 @@ class SessionEncoder:
         self._residuals = ResidualPath(identity, source.cameras, source.frame_rate_hz, settings.residuals, timer)
         self._bulk_bytes_s = BUDGET_SHARE * rate_bps / 8
         self._bulk = PacedBulk(rate_bps, EPOCH, self._choice)
+        grouped = settings.residuals.video_frames if self._choice.wants_residuals else 0
+        self._group_ns = round(GROUP_AND_SENDING * grouped * 1e9 / source.frame_rate_hz)
+        self._kept: deque[StoredMessage] = deque()
 
     def process(self, frames: FrameSet) -> Iterator[StoredMessage]:
         """The messages up to the instant of ``frames``, and those it leads to, in order of time."""
+        for message in self._messages(frames):
+            yield from self._in_step(message)
+
+    def finish(self) -> Iterator[StoredMessage]:
+        """The messages that were kept for others to go before them."""
+        yield from self._kept
+        self._kept.clear()
+
+    def _in_step(self, message: StoredMessage) -> Iterator[StoredMessage]:
+        """All but skeletons so much earlier as a group of maps comes later."""
+        if self._group_ns and channels.SKELETON.name in message.key.split("/"):
+            self._kept.append(message)
+            return
+        message = replace(message, time_ns=max(message.time_ns - self._group_ns, self.amount.first_ns or 0))
+        while self._kept and self._kept[0].time_ns <= message.time_ns:
+            yield self._kept.popleft()
+        yield message
+
+    def _messages(self, frames: FrameSet) -> Iterator[StoredMessage]:
         now_ns = frames.capture_ns
         self._clock.advance(max(now_ns - self._clock.now_ns(), 0))
         self._count(frames)

@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 import pytest
 
+from common.body.link_points import LinkPoints
 from common.geometry.rasterizer import render
 from common.runtime.daemon import Daemon
 from common.runtime.http_settings import HttpSettings
@@ -31,7 +32,7 @@ from receiver.decode import DAMAGED, DecodeError, DecodeOptions, captured_rate_h
 from receiver.decoded_files import camera_before
 from receiver.session_log import SessionLog
 from receiver.session_page import SessionPage
-from receiver.session_player import display_ticks
+from receiver.session_player import SessionPlayer, display_ticks
 from receiver.viewer.page_client import follow
 from scripts.daemon_processes import free_port
 from scripts.fidelity import compare
@@ -103,16 +104,19 @@ def test_the_same_recording_gives_the_same_file(recording, session, tmp_path):
     assert (tmp_path / "again.mcap").read_bytes() == session.read_bytes()
 
 
-def test_residual_maps_as_video_come_one_group_later_and_show_the_person(video_session, tmp_path):
-    late_s, assembler = [], ChunkAssembler()
-    for message in SessionReader(video_session, "v1").messages():
-        whole = assembler.push(decode_chunk(message.payload)) if "/bulk/" in message.key else None
-        if whole is not None and is_residual(whole):
-            header = decode_residual_header(whole)
-            assert (header.kind, frame_count(whole)) == ("video", 8)
-            late_s.append((message.time_ns - header.capture_ns) / 1e9)
-    assert len(late_s) >= 2
-    assert all(7 / RATE_HZ <= late < 16 / RATE_HZ for late in late_s)  # to fill a group, and to send it
+def test_residual_maps_as_video_are_in_step_with_their_skeletons_and_show_the_person(video_session, tmp_path):
+    stored = list(SessionReader(video_session, "v1").messages())
+    assert [message.time_ns for message in stored] == sorted(message.time_ns for message in stored)
+    groups = [whole for whole in whole_messages(stored) if is_residual(whole)]
+    assert [(decode_residual_header(group).kind, frame_count(group)) for group in groups] == [("video", 8)] * 3
+    player, apart_ns = SessionPlayer(ReceiverSettings().repository, 0, ("live", "points")), []
+    for message in stored:
+        for shown in player.take(message):
+            maps = player._animation.live._maps
+            if isinstance(shown, LinkPoints) and maps is not None:
+                apart_ns.append(player._shown_ns - maps.header.capture_ns)
+    assert len(apart_ns) == 3 * 8
+    assert set(apart_ns) == {0}
     points, said = ReceiverSettings(view=ViewSettings(headless=True, mode="points")), []
     assert decode(points, DecodeOptions(video_session, tmp_path / "png"), said.append) == 0
     picture = cv2.imread(str(sorted((tmp_path / "png").iterdir())[-1]))[..., ::-1]
