@@ -38,6 +38,12 @@ class PoseMaker:
         self._messages: asyncio.Queue[bytes] = asyncio.Queue(MESHES_WAITING)
         self._thread = ThreadPoolExecutor(1, "mesher")
 
+    @property
+    def in_hand(self) -> bool:
+        """A pose waits to be meshed or shown, or is being meshed."""
+        done = self.meshed + self.counts["pose refused"] + self.counts["pose waiting too long"]
+        return self.received > done or bool(self.meshes)
+
     def submit(self, message: bytes) -> None:
         """A pose is complete; when too many wait for meshing the oldest goes."""
         self.received += 1

@@ -250,9 +250,11 @@ class Show:
 
     def _report(self) -> None:
         wants = WANTS_RESIDUALS * self.viewer.wants_points | WANTS_LIVE * self.viewer.wants_live
-        if self._state.repository_poses > 0 and not self.viewer.wants_poses:  # with one, whoever looks sees somebody
+        poses = self._state.repository_poses
+        # One is enough where nobody looks, and until the first sight: more would take this machine's time from it.
+        if not self.viewer.wants_poses if poses > 0 else self._poses.in_hand:
             wants |= SPARES_POSES
-        self._channels.send_report(self._state.repository_poses, wants)
+        self._channels.send_report(poses, wants)
 
     def _tell_status(self) -> None:
         frame = self._state.frame

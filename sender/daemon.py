@@ -1,7 +1,7 @@
 """The sender daemon: opens its session while what follows a person is loaded, and sends until its source ends.
 
-NumPy, numba and the kernels take longer to load than anything else here, so they begin first, on a thread of their own.
-By their end receivers that know this site have dialled it, and their reports are coming.
+NumPy, numba and what uses them take longer to load than anything else here, so that begins first, on a thread of its
+own. By its end receivers that know this site have dialled it, and their reports are coming.
 """
 
 from __future__ import annotations
@@ -34,15 +34,14 @@ class SenderDaemon:
             DaemonError: a camera, port or file that cannot be used; the message says which.
         """
         settings = self._settings
-        loader = ThreadPoolExecutor(1, "loader")
-        loaded = loader.submit(_load_stream)
+        loaded = ThreadPoolExecutor(1, "loader").submit(_load_stream)  # not the loop's, for which its end would wait
         link = with_endpoints(settings.link, "sender")
         self._check_site(link)
         with open_self_view(settings.self_view, settings.site, settings.person, link) as self_view:
             link = link if self_view is None else self_view.with_private_link(link)
             async with open_session(link, self._allowed(self_view)) as session:
                 run_stream = await asyncio.wrap_future(loaded)
-                await run_stream(settings, session, daemon, self_view, loader)
+                await run_stream(settings, session, daemon, self_view)
 
     def _check_site(self, link: LinkSettings) -> None:
         certificate, site = own_certificate(link), self._settings.site

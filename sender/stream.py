@@ -11,9 +11,7 @@ import logging
 import secrets
 import time
 from collections.abc import Callable
-from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import AbstractAsyncContextManager
-from dataclasses import dataclass
+from contextlib import AbstractAsyncContextManager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -51,41 +49,24 @@ log = logging.getLogger(__name__)
 FIRST_SAVE_NS = 3_000_000_000  # after the first skeleton: by then the body has been seen from all sides
 SAVE_EVERY_NS = 30_000_000_000
 LIVE_INTERVAL_NS = 120_000_000  # of residual maps that only bring meshes alive: few and fine, as they age little
+HTTP_WAITS_S = 3.0  # at most, for the first pose: what serves it takes as long to load as many kernels
 LAST_WORDS_S = 0.5  # after the last frame of a recording, for what is still on its way
 
 
-@dataclass(frozen=True, slots=True)
-class Rehearsed:
-    """When the kernels of each path are there. ``start``: of what looks for a person who is not known."""
-
-    start: Future[None] | None
-    candidates: Future[None]
-    residuals: Future[None]
-
-
 async def run_stream(
-    settings: SenderSettings,
-    session: ZenohSession,
-    daemon: Daemon,
-    self_view: SelfView | None,
-    loader: ThreadPoolExecutor,
+    settings: SenderSettings, session: ZenohSession, daemon: Daemon, self_view: SelfView | None
 ) -> None:
-    """Capture and send until the source ends. Kernels are loaded by ``loader``, one path's after the other's.
+    """Capture and send until the source ends.
 
     Raises:
         DaemonError: a camera, port or file that cannot be used; the message says which.
     """
     store = BodyStore(settings.state_folder, settings.site, settings.person)
     body = store.load()
-    rehearsed = Rehearsed(
-        loader.submit(rehearse_start) if body is None else None,
-        loader.submit(rehearse_candidates),
-        loader.submit(rehearse_residuals),
-    )
     try:
         source = await asyncio.to_thread(open_source, settings.capture)
         try:
-            stream = Stream(settings, source, session, store, body, rehearsed, self_view)
+            stream = Stream(settings, source, session, store, body, self_view)
             try:
                 await stream.run(daemon)
             finally:
@@ -110,7 +91,6 @@ class Stream:
         session: ZenohSession,
         store: BodyStore,
         body: BodyModel | None,
-        rehearsed: Rehearsed,
         self_view: SelfView | None,
     ) -> None:
         self._settings = settings
@@ -118,7 +98,6 @@ class Stream:
         self._store = store
         self._clock = clock = MonotonicClock()
         self._health = Health()
-        self._rehearsed = rehearsed
         self._self_view = self_view
         self._timer = StageTimer(clock)
         self._statistics = RunStatistics(self._timer)
@@ -143,16 +122,22 @@ class Stream:
             clock,
             settings.residuals.share,
         )
-        self._fitting = ComputeWorker("fitting", self._fit, self._on_tracked)
+        hurried = settings.capture.source != "recording" or settings.capture.realtime
+        self._at_once = hurried and body is not None
+        fitting, candidates, residuals = (
+            None if self._at_once else rehearse
+            for rehearse in (rehearse_start, rehearse_candidates, rehearse_residuals)
+        )
+        self._fitting = ComputeWorker("fitting", self._fit, self._on_tracked, fitting)
         self._meshing = ComputeWorker(
-            "candidates", self._make_candidate, self._on_candidates, rehearsed.candidates.result, background=True
+            "candidates", self._make_candidate, self._on_candidates, candidates, background=True
         )
         # Not with the candidates: one of those takes as long as ten frames, and old maps are of no use.
         self._mapping = ComputeWorker(
-            "residuals", self._residuals.process, self._on_residual, rehearsed.residuals.result, background=True
+            "residuals", self._residuals.process, self._on_residual, residuals, background=True
         )
+        self._first_pose = asyncio.Event()
         self._synchronizer = open_synchronizer(source, settings.capture.patience_ms)
-        hurried = settings.capture.source != "recording" or settings.capture.realtime
         deliver = self._fitting.submit if hurried else self._fitting.submit_in_turn
         self._capture = CaptureThread(source, self._synchronizer, deliver, clock)
         self._last_status = ""
@@ -179,19 +164,19 @@ class Stream:
         """Capture, fit, publish until the source ends.
 
         The first frames of somebody unknown are worth as much as any: they wait until all kernels are there. Where the
-        person is known somebody may be waiting for the picture: the first frames load what they need. HTTP comes last.
+        person is known somebody may be waiting for the picture: the first frames load what they need, and HTTP waits.
         """
         self._channels.open(self._links.on_report, self._links.on_repository, self.metrics.text)
         async with asyncio.TaskGroup() as group:
             lasting = [
                 group.create_task(part.run()) for part in (self._fitting, self._meshing, self._mapping, self._links)
             ]
-            if self._rehearsed.start is not None:
-                await asyncio.wrap_future(self._rehearsed.start)
-                await self._workers_ready()
+            await asyncio.gather(*(worker.wait_ready() for worker in (self._fitting, self._meshing, self._mapping)))
             capturing = group.create_task(self._capture.run())
             self._health.ready, self._health.reason = True, "capturing"
-            await self._workers_ready()
+            with suppress(TimeoutError):
+                async with asyncio.timeout(HTTP_WAITS_S if self._at_once else 0):
+                    await self._first_pose.wait()
             served = await asyncio.to_thread(_load_served)
             async with served(self._settings.http, self.metrics, self._health):
                 daemon.announce_ready()
@@ -201,9 +186,6 @@ class Stream:
                 await asyncio.sleep(LAST_WORDS_S)
             for task in lasting:
                 task.cancel()
-
-    async def _workers_ready(self) -> None:
-        await asyncio.gather(*(worker.wait_ready() for worker in (self._fitting, self._meshing, self._mapping)))
 
     def _fit(self, frames: FrameSet) -> TrackedFrame:
         """On the fitting thread. The body is saved from here, since only this thread may read the tracker."""
@@ -266,6 +248,7 @@ class Stream:
 
     def _on_candidates(self, found: Candidates) -> None:
         """On the loop: what may be sent now."""
+        self._first_pose.set()
         self._pace.done(self._candidate_work_ns)
         self._scheduler.offer(found.pose_id, found.encoded, found.capture_ns, found.worth, found.preview)
         self._candidate_bytes.append(len(found.encoded))

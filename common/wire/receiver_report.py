@@ -23,7 +23,7 @@ from common.wire.header import (
 REPORT_MAX_BYTES = 1024
 MAX_MISSING_CHUNKS = 128
 WANTS_RESIDUALS, WANTS_LIVE = 1, 2  # bits of ``wants``: residual maps as points are made of; a few, for a live surface
-SPARES_POSES = 4  # another: it has candidate poses, and nobody looks at them
+SPARES_POSES = 4  # another: it has a candidate pose, and no use for more at the moment
 MISSING_SPAN = 0xFFFF  # a missing chunk lies at most this far below the next expected one
 REPOSITORY_MAX_POSES = 0xFFFF
 
