@@ -118,7 +118,6 @@ class ReceiverChannels:
         while True:
             await asyncio.sleep(SPLIT_PERIOD_S)
             if self._split.is_split(self._clock.now_ns()):
-                self._split = SplitSession()  # where there can be no other session, this is said once
                 log.warning("links are up and nothing comes: another session")
                 await self._session.reopen()
 

@@ -144,6 +144,18 @@ def _any(value: Any) -> Any:
     return value
 
 
+async def test_who_listens_can_take_another_session_on_the_same_port(sites: Path) -> None:
+    async with stream(sites) as made:
+        ports = {("tcp", made.port), ("udp", made.port)}
+        reopening = asyncio.create_task(made.studio.reopen())
+        while not reopening.done():  # what is said meanwhile is heard by nobody
+            made.skeleton.put(b"skeleton")
+            await asyncio.sleep(0.01)
+        await reopening
+        assert await made.flows()
+        assert ports <= listening_ports(os.getpid())
+
+
 async def test_without_a_valid_certificate_nobody_gets_in(sites: Path) -> None:
     async with stream(sites) as made:
         lobby, foreign, expired = (sites / name for name in ("lobby", "foreign", "expired"))

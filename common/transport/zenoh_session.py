@@ -12,10 +12,11 @@ import json
 import logging
 import re
 import threading
-from collections.abc import AsyncIterator, Callable, Iterable
+from collections.abc import AsyncIterator, Callable, Iterable, Sequence
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from functools import partial
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 import zenoh
@@ -32,6 +33,7 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 CLOSE_WITHIN_S = 1.0
+OPEN_TRIES, OPEN_AGAIN_S = 10, 0.5  # to open another session in place of one
 WARN_DAYS = 30  # before a certificate expires
 Result = TypeVar("Result")
 Entity = TypeVar("Entity", bound=Any)  # what Zenoh declares; all of them can be undeclared
@@ -154,20 +156,20 @@ class Declared(Generic[Entity]):
 
 
 class ZenohSession:
-    """An open session. Its callbacks run on the loop that opened it. ``open_another``: one of the same settings."""
+    """An open session. Its callbacks run on the loop that opened it. ``successors``: what ``reopen`` opens."""
 
     def __init__(
         self,
         session: zenoh.Session,
         loop: asyncio.AbstractEventLoop,
         certificate: SiteCertificate | None = None,
-        open_another: Callable[[], zenoh.Session] | None = None,
+        successors: Sequence[Callable[[], zenoh.Session]] = (),
     ) -> None:
         self.zenoh = session
         self.certificate = certificate
         self.loop = loop
         self.declared: set[Declared[Any]] = set()
-        self._open_another = open_another
+        self._successors = successors
 
     def on_loop(self, action: Callable[..., None], *arguments: object) -> None:
         """Have the loop call ``action``; from any thread, also when the loop has closed (nothing happens then)."""
@@ -180,16 +182,17 @@ class ZenohSession:
         self.declared.add(made)
         return made
 
-    async def reopen(self) -> bool:
-        """Take another session, with another id, in place of this one; False where it cannot be: who listens has its
-        port in use."""
-        if self._open_another is None:
-            return False
-        before, self.zenoh = self.zenoh, await _in_thread(self._open_another, too_late=_close)
-        for declared in self.declared:
-            declared.now = declared.declare(self.zenoh)
-        await _closed(before)
-        return True
+    async def reopen(self) -> None:
+        """Take another session, with another id, in place of this one.
+
+        Raises:
+            TransportError: it cannot be opened.
+        """
+        for successor in self._successors:
+            before, self.zenoh = self.zenoh, await _opened(successor)
+            for declared in self.declared:
+                declared.now = declared.declare(self.zenoh)
+            await _closed(before)
 
     def add_metrics(self, metrics: Metrics) -> None:
         """What an operator has to know of the link."""
@@ -262,12 +265,32 @@ async def open_session(settings: LinkSettings, allowed: Iterable[Allowance] = ()
     if certificate is not None and certificate.days_left(datetime.now(UTC)) < WARN_DAYS:
         log.warning("%s: expires on %s", certificate.certificate_file, f"{certificate.expires:%Y-%m-%d %H:%M} UTC")
     listens = bool(json.loads(config.get_json("listen/endpoints")))
-    another = None if listens else lambda: zenoh.open(zenoh_config(settings, certificate, allowed))
-    opened = ZenohSession(session, loop, certificate, another)
+    alike = partial(_open, settings, certificate, allowed)
+    # The port of one that listens is free when it has closed. Meanwhile there is one without links.
+    without_links = partial(_open, LinkSettings(realm=settings.realm))
+    opened = ZenohSession(session, loop, certificate, (without_links, alike) if listens else (alike,))
     try:
         yield opened
     finally:
         await _closed(opened.zenoh)
+
+
+def _open(
+    settings: LinkSettings, certificate: SiteCertificate | None = None, allowed: Iterable[Allowance] = ()
+) -> zenoh.Session:
+    return zenoh.open(zenoh_config(settings, certificate, allowed))
+
+
+async def _opened(how: Callable[[], zenoh.Session]) -> zenoh.Session:
+    """Tried again while the port of the session before is not yet free."""
+    for tries_left in reversed(range(OPEN_TRIES)):
+        try:
+            return await _in_thread(how, too_late=_close)
+        except zenoh.ZError as error:
+            if not tries_left:
+                raise TransportError(f"no other Zenoh session: {_first_line(error)}") from error
+            await asyncio.sleep(OPEN_AGAIN_S)
+    raise AssertionError
 
 
 async def _closed(session: zenoh.Session) -> None:
