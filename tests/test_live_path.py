@@ -41,8 +41,8 @@ class Receiver:
 
     def packet(self, data: bytes) -> None:
         new = self.maps.take(data, lambda _: {REVISION: BODY}, False)
-        assert new is not None
-        self.animation.live.note_maps(new.maps)
+        assert new
+        self.animation.live.note_maps(new[-1].maps)
 
     def skeleton(self, pose: SkeletonPose, *arrived: ReceivedPose, epoch: int = EPOCH) -> Shown:
         self.sequence += 1
