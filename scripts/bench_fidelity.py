@@ -31,6 +31,7 @@ SESSION_S = 180.0
 CAPTURED_S = 14.0  # of a motion, repeated: what is held in memory
 WARM_UP_S = 10.0
 MEASURED_EVERY = 29  # frames: prime, so that a repeated motion is not looked at in the same few places
+LONG_S, LONG_EVERY = 120.0, 61  # such sessions are looked at less often
 BANDWIDTHS_BPS = (0.1e6, 0.2e6, 1e6, 10e6)
 SEEN_AFTER = 3  # frames: 100 ms
 CASES = (("male_avg", "14_06"), ("male_avg", "02_10"))
@@ -143,7 +144,7 @@ def measured(method: Method, recorded: Capture, seconds: float) -> dict[str, tup
     """Plays a session to a method and compares what is on screen with the truth: that of the frame shown, and
     (``psnr_seen_db``) that of the instant, for which the screen may wait 100 ms: a player shows, of what it has then,
     the newest that is not of a later instant. Where nobody is on screen yet there is nothing to compare."""
-    count = int(seconds * FRAME_RATE_HZ)
+    count, every = int(seconds * FRAME_RATE_HZ), LONG_EVERY if seconds >= LONG_S else MEASURED_EVERY
     shown: dict[int, Likeness] = {}
     seen: dict[int, Likeness] = {}
     first_k, measured_count = None, 0
@@ -153,12 +154,12 @@ def measured(method: Method, recorded: Capture, seconds: float) -> dict[str, tup
         screens.append(method.screen)
         if method.screen is not None and first_k is None:
             first_k = k
-        if k % MEASURED_EVERY == 0:
+        if k % every == 0:
             measured_count += 1
             if method.screen is not None:
                 shown[k] = _fidelity(method.screen, recorded, method.screen.shown_k)
         instant = k - SEEN_AFTER
-        if instant % MEASURED_EVERY == 0:
+        if instant % every == 0:
             at = next((s for s in reversed(screens) if s is not None and s.shown_k <= instant), None)
             if at is not None and at is screens[0] and at.shown_k == instant:
                 seen[instant] = shown[instant]

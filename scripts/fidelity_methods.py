@@ -38,7 +38,6 @@ from sender.reconstruction.depth_fusion import DepthFusion, PosedViews
 CANDIDATE_EVERY = 6  # frames: 200 ms, as in the sender
 LEAST_CONFIDENCE = 0.5
 WRONG_SHARE, WRONG_BY_RAD = 0.2, 0.35  # of the candidates; at the shoulder: 12 to 20 cm at a stretched arm's wrist
-DEPTH_STEP_MM, JPEG_QUALITY = 2, 85
 RIGGING = Rigging(CandidateSettings().segmentation, CandidateSettings().views)
 
 
@@ -79,7 +78,7 @@ def encoded_candidate(
     posed_views = PosedViews(k * FRAME_NS, captured.views, forward_kinematics(fitted[0], fitted[1]))
     views = captured.views if fusion is None else fusion.fused(posed_views, fitted[0])
     candidate = CandidatePose(pose_id, 0, 1, k * FRAME_NS, fitted[0], fitted[1], views, RIGGING)
-    return encode_candidate_pose(candidate, JPEG_QUALITY, DEPTH_STEP_MM)
+    return encode_candidate_pose(candidate, CandidateSettings().quality)
 
 
 class _NoClock:

@@ -1,13 +1,14 @@
 """Codecs the residual maps are measured beside, all fed the same views or points; what they decode to is sampled again.
 
 Each frame by itself: "yang" (Yang et al. 2006: zlib depth, JPEG colour; here as good as it gets: depth as differences,
-the background filled), "rvl" (our candidate poses' views: RVL and zstd depth, JPEG), "draco" (a point cloud).
+the background filled), "rvl" (RVL and zlib depth, JPEG), "views" (our candidate poses'), "draco" (a point cloud).
 As video: "h264", "h265" with presets for real time, "h265-slow" offline, colour and depth, silhouettes without loss.
 """
 
 from __future__ import annotations
 
 import time
+import zlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -16,10 +17,13 @@ import numpy as np
 
 from common.body.view import View
 from common.geometry.point_cloud import PointCloud
+from common.wire.colour_codec import decode_colour, encode_colour
 from common.wire.view_codec import decode_view, encode_view
+from common.wire.view_quality import ViewQuality
 from scripts.fidelity_frames import Rung, yang_views
 from scripts.fidelity_video import H265_LIVE, VideoCoder, VideoRung, coded_video
 from scripts.residual_sequences import PosedSequence
+from scripts.rvl import decode_rvl, encode_rvl, in_steps
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,6 +39,7 @@ Encode = Callable[[PosedSequence, int], CodedFrame]
 
 YANG = {"low": Rung(3, 60, 8), "half": Rung(2, 75, 4), "full": Rung(1, 50, 2), "best": Rung(1, 85, 1)}
 RVL = {"low": (30, 8), "mid": (50, 4), "high": (85, 1)}  # JPEG quality, depth step [mm]
+VIEWS = {"low": ViewQuality("webp", 40, 4), "mid": ViewQuality("jpeg", 50, 2), "high": ViewQuality("jpeg", 85, 0)}
 DRACO = {"low": (4, 9, 4), "half": (2, 10, 5), "full": (1, 10, 6), "best": (1, 11, 8)}  # of so many points one, bits
 VIDEO_RATES_BPS = {"0.3M": 0.3e6, "0.6M": 0.6e6, "1.2M": 1.2e6, "2.5M": 2.5e6, "5M": 5e6}
 VIDEO_CODERS = {
@@ -53,9 +58,29 @@ def yang_frame(rung: Rung, sequence: PosedSequence, k: int) -> CodedFrame:
 
 
 def rvl_frame(quality: tuple[int, int], sequence: PosedSequence, k: int) -> CodedFrame:
-    """RVL, zstd and JPEG."""
+    """RVL, zlib and JPEG."""
+    jpeg_quality, step_mm = quality
+    views = sequence.frame(k).views
     begun = time.perf_counter()
-    coded = [encode_view(view, *quality) for view in sequence.frame(k).views]
+    depth = [zlib.compress(encode_rvl(in_steps(view.depth_mm, step_mm)), 6) for view in views]
+    colour = [encode_colour(view.colour, view.depth_mm, "jpeg", jpeg_quality) for view in views]
+    took = time.perf_counter() - begun
+
+    def decoded() -> PointCloud:
+        back = []
+        for view, packed, jpeg in zip(views, depth, colour, strict=True):
+            height, width = view.depth_mm.shape
+            steps = decode_rvl(zlib.decompress(packed), height, width)
+            back.append(replace(view, depth_mm=steps * np.uint16(step_mm), colour=decode_colour(jpeg, height, width)))
+        return sequence.points(back)
+
+    return CodedFrame(sum(map(len, depth + colour)), took, decoded)
+
+
+def views_frame(quality: ViewQuality, sequence: PosedSequence, k: int) -> CodedFrame:
+    """As a candidate pose's views are coded."""
+    begun = time.perf_counter()
+    coded = [encode_view(view, quality) for view in sequence.frame(k).views]
     took = time.perf_counter() - begun
 
     def decoded() -> PointCloud:
@@ -117,6 +142,8 @@ def rivals() -> dict[str, Callable[[PosedSequence], Encode]]:
         found[f"yang/{level}"] = lambda _, rung=rung: partial(yang_frame, rung)  # type: ignore[misc]
     for level, quality in RVL.items():
         found[f"rvl/{level}"] = lambda _, quality=quality: partial(rvl_frame, quality)  # type: ignore[misc]
+    for level, view_quality in VIEWS.items():
+        found[f"views/{level}"] = lambda _, quality=view_quality: partial(views_frame, quality)  # type: ignore[misc]
     for level, settings in DRACO.items():
         found[f"draco/{level}"] = lambda _, settings=settings: partial(draco_frame, settings)  # type: ignore[misc]
     for name in VIDEO_CODERS:

@@ -11,6 +11,7 @@ from common.body.rigging import Segmentation, Views
 from common.runtime.http_settings import HttpSettings
 from common.transport.channels import check_name
 from common.transport.link_settings import LinkSettings
+from common.wire.view_quality import ViewQuality
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,11 +69,11 @@ class TrackingSettings:
 class CandidateSettings:
     """Candidate poses. ``choice``: what is sent next, by "coverage" or by the "paper"'s χ. ``interval_ms``: time
     between two that are considered; ``busy_share``: at most this share of a core is spent on making them.
-    ``least_confidence``: of a fit, for its frame to become one. ``jpeg_quality``, ``depth_step_mm``: how finely a view
-    is sent; the ``thin_`` ones where a pose would take long. ``send_log``: a file that gets a JSON line for every send.
-    ``fused_frames``: so many frames are averaged into a pose's depth. ``segmentation``: what belongs to which link.
-    ``views``: one surface of all cameras, or one for each. ``region_weights``: ω where it is not the default;
-    ``score_form``: what σ divides by."""
+    ``least_confidence``: of a fit, for its frame to become one. ``jpeg_quality``, ``depth_error_mm``: how finely a view
+    is sent; ``thin_webp_quality``, ``thin_depth_error_mm``: where a pose would take long. ``send_log``: a file that
+    gets a JSON line for every send. ``fused_frames``: so many frames are averaged into a pose's depth.
+    ``segmentation``: what belongs to which link. ``views``: one surface of all cameras, or one for each.
+    ``region_weights``: ω where it is not the default; ``score_form``: what σ divides by."""
 
     enabled: bool = True
     choice: Literal["coverage", "paper"] = "coverage"
@@ -80,9 +81,9 @@ class CandidateSettings:
     busy_share: float = 0.25
     least_confidence: float = 0.5
     jpeg_quality: int = 85
-    depth_step_mm: int = 2
-    thin_jpeg_quality: int = 50
-    thin_depth_step_mm: int = 8
+    depth_error_mm: int = 1
+    thin_webp_quality: int = 40
+    thin_depth_error_mm: int = 4
     fused_frames: int = 4
     segmentation: Segmentation = "voronoi"
     views: Views = "zippered"
@@ -97,15 +98,25 @@ class CandidateSettings:
             raise ValueError(f"busy_share: {self.busy_share} is outside 0.01..1")
         if not 0 <= self.least_confidence <= 1:
             raise ValueError(f"least_confidence: {self.least_confidence} is outside 0..1")
-        for name in ("jpeg_quality", "thin_jpeg_quality"):
-            if not 30 <= getattr(self, name) <= 100:
-                raise ValueError(f"{name}: {getattr(self, name)} is outside 30..100")
-        for name in ("depth_step_mm", "thin_depth_step_mm"):
-            if not 1 <= getattr(self, name) <= 16:
-                raise ValueError(f"{name}: {getattr(self, name)} is outside 1..16")
+        for name in ("jpeg_quality", "thin_webp_quality"):
+            if not 20 <= getattr(self, name) <= 100:
+                raise ValueError(f"{name}: {getattr(self, name)} is outside 20..100")
+        for name in ("depth_error_mm", "thin_depth_error_mm"):
+            if not 0 <= getattr(self, name) <= 16:
+                raise ValueError(f"{name}: {getattr(self, name)} is outside 0..16")
         if not 0 <= self.fused_frames <= 30:
             raise ValueError(f"fused_frames: {self.fused_frames} is outside 0..30")
         region_weights(self.region_weights)
+
+    @property
+    def quality(self) -> ViewQuality:
+        """How finely views are sent as a rule."""
+        return ViewQuality("jpeg", self.jpeg_quality, self.depth_error_mm)
+
+    @property
+    def thin_quality(self) -> ViewQuality:
+        """How finely over a thin link."""
+        return ViewQuality("webp", self.thin_webp_quality, self.thin_depth_error_mm)
 
 
 @dataclass(frozen=True, slots=True)

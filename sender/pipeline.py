@@ -258,8 +258,8 @@ class CandidatePath:
         settings, budget_bytes = self._settings, self._budget_bytes
         thin = budget_bytes is not None and self._fine_bytes > budget_bytes * THIN_S
         if thin:
-            return encode_candidate_pose(candidate, settings.thin_jpeg_quality, settings.thin_depth_step_mm)
-        encoded = encode_candidate_pose(candidate, settings.jpeg_quality, settings.depth_step_mm)
+            return encode_candidate_pose(candidate, settings.thin_quality)
+        encoded = encode_candidate_pose(candidate, settings.quality)
         self._fine_bytes = len(encoded)
         return encoded
 

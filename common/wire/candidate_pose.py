@@ -19,7 +19,8 @@ from common.body.view import View
 from common.wire.body_message import SKELETON_BYTES, decode_skeleton_sizes, encode_skeleton_sizes
 from common.wire.header import CANDIDATE_POSE_VERSION, TIME_MAX_NS, U8_MAX, U32_MAX, WireError, check_start, checked_int
 from common.wire.skeleton_packet import POSE_BYTES, decode_pose, encode_pose
-from common.wire.view_codec import JPEG_QUALITY, VIEW_MAX_PIXELS, decode_view, encode_view
+from common.wire.view_codec import VIEW_MAX_PIXELS, decode_view, encode_view
+from common.wire.view_quality import FINE, ViewQuality
 
 CANDIDATE_POSE_MAX_BYTES = 1 << 22
 MAX_VIEWS = 16
@@ -47,8 +48,8 @@ class CandidatePose:
     rigging: Rigging = DEFAULT_RIGGING
 
 
-def encode_candidate_pose(candidate: CandidatePose, jpeg_quality: int = JPEG_QUALITY, depth_step_mm: int = 1) -> bytes:
-    """Bytes of a candidate pose, at most ``CANDIDATE_POSE_MAX_BYTES``; see ``encode_view`` for the settings.
+def encode_candidate_pose(candidate: CandidatePose, quality: ViewQuality = FINE) -> bytes:
+    """Bytes of a candidate pose, at most ``CANDIDATE_POSE_MAX_BYTES``.
 
     Raises:
         WireError: a number outside its range, no view or too many, or more bytes or pixels than allowed.
@@ -69,7 +70,7 @@ def encode_candidate_pose(candidate: CandidatePose, jpeg_quality: int = JPEG_QUA
         encode_pose(candidate.pose),
     ]
     for view in candidate.views:
-        encoded = encode_view(view, jpeg_quality, depth_step_mm)
+        encoded = encode_view(view, quality)
         parts += [_LENGTH.pack(len(encoded)), encoded]
     data = b"".join(parts)
     if len(data) > CANDIDATE_POSE_MAX_BYTES:

@@ -1,6 +1,6 @@
 """A candidate pose made small: who sees nobody yet sees somebody at once, coarsely, even over a thin link.
 
-Half or a third of the pixels each way, a rough JPEG and rough depth: a tenth of the bytes.
+A third of the pixels each way, rough colour and rough depth: a tenth of the bytes.
 """
 
 from __future__ import annotations
@@ -13,15 +13,16 @@ from numba import njit
 from common.body.view import View
 from common.geometry.camera_model import Camera
 from common.wire.candidate_pose import CandidatePose, encode_candidate_pose
+from common.wire.view_quality import ViewQuality
 
 SHRINK = 3
-JPEG_QUALITY, DEPTH_STEP_MM = 40, 8
+QUALITY = ViewQuality("webp", 40, 4)
 
 
 def encode_preview(candidate: CandidatePose) -> bytes:
     """Bytes of the same pose, id and all, of small views."""
     views = tuple(small_view(view, SHRINK) for view in candidate.views)
-    return encode_candidate_pose(replace(candidate, views=views), JPEG_QUALITY, DEPTH_STEP_MM)
+    return encode_candidate_pose(replace(candidate, views=views), QUALITY)
 
 
 def small_view(view: View, shrink: int) -> View:

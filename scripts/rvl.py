@@ -50,8 +50,14 @@ def decode_rvl(data: bytes, height: int, width: int) -> NDArray[np.uint16]:
     image = np.zeros(height * width, np.uint16)
     status = _decode(np.frombuffer(data, np.uint8), image)
     if status != _OK:
-        raise WireError(f"depth: {_REASONS[status]}")
+        raise WireError(f"RVL: {_REASONS[status]}")
     return image.reshape(height, width)
+
+
+def in_steps(depth_mm: NDArray[np.uint16], step_mm: int) -> NDArray[np.uint16]:
+    """Depth (h, w) [mm] in steps, rounded to the nearest, at least 1 where there is a reading."""
+    steps = (depth_mm.astype(np.int64) + step_mm // 2) // step_mm
+    return np.where(depth_mm > 0, np.maximum(steps, 1), 0).astype(np.uint16)
 
 
 @njit(nogil=True, cache=True)
