@@ -1,5 +1,5 @@
-"""What choosing costs: σ per pose, both searches over repository size, animation, keeping χ and coverage, and all of it
-live: 30 skeletons a second before 200 poses.
+"""What choosing costs: σ per pose, both searches over repository size, animation, keeping χ and coverage, coding and
+meshing a candidate pose, and all of it live: 30 skeletons a second before 200 poses.
 
 Poses are captured from the built-in performer's routine by four virtual cameras; repositories larger than what was
 captured hold it several times, each copy in memory of its own. Times are the thread's own on a core, the fastest of
@@ -28,6 +28,7 @@ from common.body.skinning import Skinning, animate, link_motion
 from common.body.surface_normals import vertex_normals
 from common.geometry.rasterizer import render
 from common.runtime.clock import Clock, MonotonicClock
+from common.wire.candidate_pose import decode_candidate_pose, encode_candidate_pose
 from receiver.pipeline import mesh_of
 from receiver.repository.pose_repository import PoseRepository, RepositorySettings
 from receiver.repository.pose_selection import PoseSelector, SelectionSettings
@@ -38,9 +39,12 @@ from scripts.line_chart import line_chart
 from scripts.run_bench import Row
 from scripts.selection_live import ThreadClock, played_live
 from sender.candidate_poses.pose_coverage import CoverageSet
+from sender.candidate_poses.preview import encode_preview
+from sender.config import CandidateSettings
 
 CAPTURED_S = 14.0
 POSE_EVERY = 8  # frames
+CODED_EVERY = 40  # frames
 SIZES = (1, 5, 10, 19, 50, 100, 200, 500, 1000)  # of a repository; 19 is where the paper's exhaustive search ends
 GOAL_VERTICES = 46_000  # of the goal for σ; its joint edges grow as the root of the vertices
 RUNS, FRAMES = 40, 20
@@ -78,6 +82,7 @@ def run(
     gaps = _gaps(material)
     yield _row(case, "exhaustive_vs_threshold_gap_max", float(gaps.max()), "1", 0.12, "DISPOSE §7.1.1")
     yield _row(case, "exhaustive_vs_threshold_gap_mean", float(gaps.mean()), "1")
+    yield from _coding(case, recorded)
     yield from _live(case, recorded, material)
     if pictures is not None:
         pictures.mkdir(parents=True, exist_ok=True)
@@ -122,6 +127,23 @@ def _costs(case: str, material: _Material) -> Iterator[Row]:
 
         figure = _fastest_ms(animated) * per_vertex
         yield _row(case, f"animate_ms_50k/{skinning}", figure, "ms", 5.0, f"with normals, scaled from {size}")
+
+
+def _coding(case: str, recorded: Capture) -> Iterator[Row]:
+    """What a candidate pose takes: bytes, of each as sent over a wide link and a thin one, and time."""
+    encoded = [encoded_candidate(k, k, recorded.frame(k), own=False) for k in range(0, recorded.length, CODED_EVERY)]
+    poses = [decode_candidate_pose(data) for data in encoded if data is not None]
+    settings, size = CandidateSettings(), f"{len(poses)} poses of {len(poses[0].views)} views"
+    for name, quality in (("pose", settings.quality), ("thin_pose", settings.thin_quality)):
+        kilobytes = [len(encode_candidate_pose(pose, quality)) / 1e3 for pose in poses]
+        yield _row(case, f"{name}_kb", float(np.median(kilobytes)), "kB", None, f"at most {max(kilobytes):.0f}, {size}")
+        ms = _fastest_ms(lambda quality=quality: encode_candidate_pose(poses[0], quality))  # type: ignore[misc]
+        yield _row(case, f"{name}_encode_ms", ms, "ms")
+    preview = [len(encode_preview(pose)) / 1e3 for pose in poses]
+    yield _row(case, "preview_kb", float(np.median(preview)), "kB", None, f"at most {max(preview):.0f}")
+    data = encode_candidate_pose(poses[0], settings.quality)
+    yield _row(case, "pose_decode_ms", _fastest_ms(lambda: decode_candidate_pose(data)), "ms")
+    yield _row(case, "pose_decode_and_mesh_ms", _fastest_ms(lambda: mesh_of(data, 0)), "ms")
 
 
 def _live(case: str, recorded: Capture, material: _Material) -> Iterator[Row]:
