@@ -1,11 +1,15 @@
-"""The live surface on the receiver: the mesh on screen follows the newest residual maps (Lien §5.2, ``live_surface``).
+"""The live surface on the receiver: the meshes on screen follow the newest residual maps (Lien §5.2, ``live_surface``).
 
-What maps show beyond a mesh is worked out at once when the mesh on screen is another, so that a switch goes from one
-mesh that looks like the maps to another; else a few times a second at most, as maps lie in the links' own frames and
-age little. It comes and goes within a moment: maps that have stopped leave the mesh its own texture.
+What maps show beyond a mesh is worked out at once when it comes on screen, so that a switch goes from one mesh that
+looks like the maps to another; else a few times a second at most, as maps lie in the links' own frames and age little,
+and of one mesh a frame, the one that has waited longest. It comes and goes within a moment: maps that have stopped
+leave meshes their own texture.
 """
 
 from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +26,19 @@ FADE_NS = 300_000_000
 STALE_NS = 1_000_000_000
 
 
+Moved = tuple[RiggedMesh, NDArray[np.float32]]  # a mesh and its links' motion (L, 3, 4)
+
+
+@dataclass(slots=True, eq=False)
+class _Following:
+    """A mesh on screen: its vertices' colours, and what ``maps`` show beyond it, worked out at ``made_ns``."""
+
+    colours: NDArray[np.uint8]
+    maps: ResidualMaps
+    made_ns: int
+    surface: LiveSurface
+
+
 class LivePath:
     """One person's. Time is the sender's, in which maps and skeletons were captured; ``note_maps`` may be called from
     another thread than the rest."""
@@ -29,9 +46,8 @@ class LivePath:
     def __init__(self, timer: StageTimer) -> None:
         self._timer = timer
         self._maps: ResidualMaps | None = None
-        self._surface: tuple[LiveSurface, ResidualMaps] | None = None  # and the maps it is of
-        self._made_ns = 0
-        self._colours: tuple[int, NDArray[np.uint8]] | None = None  # of the vertices of the pose with that id
+        self._followed: ResidualMaps | None = None  # the last ones: with them it fades out
+        self._following: dict[int, _Following] = {}  # by pose
         self._strength, self._strength_ns = 0.0, 0
 
     def note_maps(self, maps: ResidualMaps | None) -> None:
@@ -40,28 +56,24 @@ class LivePath:
 
     def forget(self) -> None:
         """Pose ids begin anew."""
-        self._surface = self._colours = None
+        self._following = {}
         self._strength = 0.0
 
-    def surface(
-        self, mesh: RiggedMesh, motion: NDArray[np.float32], T_world_link: NDArray[np.float32], epoch: int, now_ns: int
-    ) -> tuple[LiveSurface | None, float]:
-        """What ``mesh``, moved by ``motion`` (L, 3, 4) to ``T_world_link`` (L, 4, 4), is to follow, and how much of it:
-        0..1. ``epoch`` and capture time ``now_ns`` are the skeleton's."""
+    def surfaces(
+        self, poses: Sequence[Moved], T_world_link: NDArray[np.float32], epoch: int, now_ns: int
+    ) -> tuple[tuple[LiveSurface, ...], float]:
+        """What the meshes on screen, moved to ``T_world_link`` (L, 4, 4), are to follow, and how much of it: 0..1.
+        ``epoch`` and capture time ``now_ns`` are the skeleton's."""
         maps = self._maps
         fresh = maps is not None and maps.header.epoch == epoch and abs(now_ns - maps.header.capture_ns) < STALE_NS
         strength = self._faded(fresh, now_ns)
-        if not fresh:
-            maps = None if self._surface is None else self._surface[1]  # those it fades out with
-        if maps is None or strength <= 0:
-            self._surface = None
-            return None, 0.0
-        if self._is_due(mesh, maps, now_ns):
-            with self._timer.stage("live surface"):
-                self._surface = self._made(mesh, motion, T_world_link, maps), maps
-            self._made_ns = now_ns
-        assert self._surface is not None
-        return self._surface[0], strength
+        if fresh:
+            self._followed = maps
+        if self._followed is None or strength <= 0:
+            self._following = {}
+            return (), 0.0
+        self._follow(poses, T_world_link, self._followed, now_ns)
+        return tuple(following.surface for following in self._following.values()), strength
 
     def _faded(self, fresh: bool, now_ns: int) -> float:
         passed_ns, self._strength_ns = max(now_ns - self._strength_ns, 0), now_ns
@@ -69,16 +81,34 @@ class LivePath:
         self._strength = min(max(self._strength + (step if fresh else -step), 0.0), 1.0)
         return self._strength
 
-    def _is_due(self, mesh: RiggedMesh, maps: ResidualMaps, now_ns: int) -> bool:
-        if self._surface is None or self._surface[0].pose_id != mesh.pose_id:
-            return True
-        return self._surface[1] is not maps and now_ns - self._made_ns >= PERIOD_NS
+    def _follow(
+        self, poses: Sequence[Moved], T_world_link: NDArray[np.float32], maps: ResidualMaps, now_ns: int
+    ) -> None:
+        """Makes what is missing, makes anew the oldest that is due, and forgets what is no more on screen."""
+        before = self._following
+        due = [mesh.pose_id for mesh, _ in poses if self._is_due(before.get(mesh.pose_id), maps, now_ns)]
+        oldest = min(due, key=lambda pose_id: before[pose_id].made_ns, default=None)
+        self._following = {}
+        for mesh, motion in poses:
+            last = before.get(mesh.pose_id)
+            if last is None or mesh.pose_id == oldest:
+                colours = vertex_colours(mesh.mesh) if last is None else last.colours
+                with self._timer.stage("live surface"):
+                    surface = _made(mesh, motion, colours, T_world_link, maps)
+                last = _Following(colours, maps, now_ns, surface)
+            self._following[mesh.pose_id] = last
 
-    def _made(
-        self, mesh: RiggedMesh, motion: NDArray[np.float32], T_world_link: NDArray[np.float32], maps: ResidualMaps
-    ) -> LiveSurface:
-        if self._colours is None or self._colours[0] != mesh.pose_id:
-            self._colours = mesh.pose_id, vertex_colours(mesh.mesh)
-        vertices, colours = animate(mesh, motion), self._colours[1]
-        grid = at_level(maps, min(maps.header.level, LEVEL_MOST))
-        return live_surface(mesh.pose_id, *grid, T_world_link, mesh.vertex_link, vertices, colours)
+    @staticmethod
+    def _is_due(last: _Following | None, maps: ResidualMaps, now_ns: int) -> bool:
+        return last is not None and last.maps is not maps and now_ns - last.made_ns >= PERIOD_NS
+
+
+def _made(
+    mesh: RiggedMesh,
+    motion: NDArray[np.float32],
+    colours: NDArray[np.uint8],
+    T_world_link: NDArray[np.float32],
+    maps: ResidualMaps,
+) -> LiveSurface:
+    grid = at_level(maps, min(maps.header.level, LEVEL_MOST))
+    return live_surface(mesh.pose_id, *grid, T_world_link, mesh.vertex_link, animate(mesh, motion), colours)

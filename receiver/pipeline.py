@@ -161,18 +161,15 @@ class AnimationPath:
             return replace(self._shown, withheld=True, links=T_world_link[:, :3])  # points are never withheld
         self._repository.count_use(selection.pose_id)
         mesh = self._repository.get(selection.pose_id)
-        others = tuple(self._moved(pose_id, T_world_link) for pose_id in selection.others)
-        frame = replace(_shown_frame(packet, mesh, T_world_link, selection.sigma), others=others)
+        meshes = [other for other in map(self._repository.get, selection.others) if other is not None]
+        frame = _shown_frame(packet, mesh, T_world_link, selection.sigma)
+        others = tuple(MovedPose(other.pose_id, link_motion(other, T_world_link)) for other in meshes)
         assert mesh is not None
         assert frame.motion is not None
-        surface, live = self.live.surface(mesh, frame.motion, T_world_link, packet.epoch, packet.capture_ns)
-        self._shown = replace(frame, surface=surface, live=live)
+        moved = [(mesh, frame.motion), *((other, pose.motion) for other, pose in zip(meshes, others, strict=True))]
+        surfaces, live = self.live.surfaces(moved, T_world_link, packet.epoch, packet.capture_ns)
+        self._shown = replace(frame, others=others, surfaces=surfaces, live=live)
         return self._shown
-
-    def _moved(self, pose_id: int, T_world_link: NDArray[np.float32]) -> MovedPose:
-        mesh = self._repository.get(pose_id)
-        assert mesh is not None
-        return MovedPose(pose_id, link_motion(mesh, T_world_link))
 
     def _select(self, T_world_link: NDArray[np.float32]) -> Selection | None:
         begin_ns = self._clock.now_ns()

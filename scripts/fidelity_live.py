@@ -1,4 +1,4 @@
-"""DISPOSE with a live surface: the chosen mesh follows residual maps that share its link (``live_surface``).
+"""DISPOSE with a live surface: the chosen meshes follow residual maps that share its link (``live_surface``).
 
 A fixed share of the link carries maps, at the level that fills it; nothing below ``LEAST_BPS``, where candidate poses
 need every byte.
@@ -24,6 +24,7 @@ from common.wire.residual_packet import decode_residual_header
 from common.wire.skeleton_packet import quantized_pose
 from receiver.residual_decoder import ResidualDecoder, ResidualMaps
 from receiver.viewer.offscreen_viewer import render_live
+from receiver.viewer.pose_blending import blended
 from scripts.capture_files import CapturedFrame
 from scripts.fidelity import Picture
 from scripts.fidelity_capture import FRAME_NS, FRAME_RATE_HZ
@@ -90,7 +91,8 @@ class DisposeLive(Dispose):
         super()._show(k, mesh, motion, others)
         maps, T_world_link = self._decoder.newest, self._T_world_link
         if maps is not None and T_world_link is not None:
-            self.screen = Screen(k, partial(live_picture, mesh, motion, maps, T_world_link, self._followed))
+            moved = [(mesh, motion), *others]
+            self.screen = Screen(k, partial(live_picture, moved, maps, T_world_link, self._followed))
 
 
 def _changed(a: Skeleton, b: Skeleton) -> bool:
@@ -99,6 +101,15 @@ def _changed(a: Skeleton, b: Skeleton) -> bool:
 
 
 def live_picture(
+    poses: Sequence[Moved], maps: ResidualMaps, T_world_link: NDArray[np.float32], followed: Followed,
+    cameras: list[Camera],
+) -> list[Picture]:  # fmt: skip
+    """The mean of meshes that follow maps, seen by the cameras."""
+    pictures = [_following(*each, maps, T_world_link, followed, cameras) for each in poses]
+    return [blended(of_one_camera) for of_one_camera in zip(*pictures, strict=True)]
+
+
+def _following(
     mesh: RiggedMesh,
     motion: NDArray[np.float32],
     maps: ResidualMaps,

@@ -24,7 +24,7 @@ from common.wire.candidate_pose import CandidatePose, encode_candidate_pose
 from common.wire.skeleton_packet import SkeletonPacket
 from receiver.config import RepositorySettings
 from receiver.pipeline import AnimationPath, ReceivedPose, SkeletonToShow, mesh_of
-from receiver.viewer.pose_blending import blended, shares
+from receiver.viewer.pose_blending import blended
 from scripts.capture_files import CapturedFrame
 from scripts.fidelity import Picture
 from scripts.fidelity_capture import FRAME_NS, FRAME_RATE_HZ
@@ -92,7 +92,7 @@ Moved = tuple[RiggedMesh, NDArray[np.float32]]  # a mesh and its links' motion
 def blended_picture(moved: list[Moved], cameras: list[Camera]) -> list[Picture]:
     """The mean of several meshes' pictures, as the receiver's viewers show it."""
     pictures = zip(*(animated_picture(*each, cameras) for each in moved), strict=True)
-    return [blended(of_one_camera, shares(len(moved) - 1, 0)) for of_one_camera in pictures]
+    return [blended(of_one_camera) for of_one_camera in pictures]
 
 
 def animated_picture(mesh: RiggedMesh, motion: NDArray[np.float32], cameras: list[Camera]) -> list[Picture]:

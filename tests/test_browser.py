@@ -195,7 +195,7 @@ def following(person: RiggedMesh, time_s: float, strength: float) -> ShownFrame:
     layout = map_layout(SKELETON, 10_000, 60.0)
     maps = closed(layout, project_points(layout, T_world_link, person.vertex_link, wider, newer))
     surface = live_surface(7, layout, maps, T_world_link, person.vertex_link, vertices, colours)
-    return dataclasses.replace(frame, surface=surface, live=strength)
+    return dataclasses.replace(frame, surfaces=(surface,), live=strength)
 
 
 @pytest.mark.parametrize("strength", [1.0, 0.4])

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections import deque
+from itertools import pairwise
 
 import numpy as np
 import pytest
 
-from common.body.rigged_mesh import build_rigged_mesh
+from common.body.rigged_mesh import RiggedMesh, build_rigged_mesh
 from common.body.skeleton_pose import SkeletonPose
 from common.runtime.clock import ManualClock
 from common.runtime.stage_timer import StageTimer
@@ -55,6 +56,12 @@ def shirt() -> ChangingShirt:
     return ChangingShirt()
 
 
+def mesh_at(time_s: float) -> RiggedMesh:
+    """Another candidate pose, 8, of the same person."""
+    pose = pose_at(time_s)
+    return build_rigged_mesh(8, round(time_s * 1e9), SKELETON, pose, capsule_views(pose))
+
+
 def shown_for(here: Receiver, shirt: ChangingShirt, duration_ns: int, send: bool = True) -> list[Shown]:
     frames = []
     for _ in range(round(duration_ns / FRAME_NS)):
@@ -80,7 +87,7 @@ def test_a_shirt_that_turns_red_is_seen_to_although_no_new_mesh_comes(mode: View
 
 def test_it_fades_in_stays_and_fades_out_when_maps_stop(shirt: ChangingShirt) -> None:
     here = Receiver()
-    assert here.skeleton(pose_at(0.0), ReceivedPose(EPOCH, shirt.mesh)).frame.surface is None
+    assert here.skeleton(pose_at(0.0), ReceivedPose(EPOCH, shirt.mesh)).frame.surfaces == ()
     rising = [shown.frame.live for shown in shown_for(here, shirt, FADE_NS + 3 * FRAME_NS)]
     assert 0 < rising[0] < rising[3] < rising[6] < 1
     assert rising[-1] == 1
@@ -91,27 +98,51 @@ def test_it_fades_in_stays_and_fades_out_when_maps_stop(shirt: ChangingShirt) ->
     falling = [shown.frame.live for shown in last]
     assert min(np.diff(falling)) > -0.12
     assert falling[-1] == 0
-    assert last[-1].frame.surface is None
+    assert last[-1].frame.surfaces == ()
 
 
 def test_another_mesh_follows_at_once_and_as_much(shirt: ChangingShirt) -> None:
     here = Receiver()
     here.skeleton(pose_at(0.0), ReceivedPose(EPOCH, shirt.mesh))
     shown_for(here, shirt, FADE_NS + 3 * FRAME_NS)
-    now = pose_at(here.now_ns / 1e9)
-    closer = build_rigged_mesh(8, here.now_ns, SKELETON, now, capsule_views(now))
-    frame = here.skeleton(now, ReceivedPose(EPOCH, closer)).frame
+    time_s = here.now_ns / 1e9
+    frame = here.skeleton(pose_at(time_s), ReceivedPose(EPOCH, mesh_at(time_s))).frame
     assert frame.pose_id == 8
-    assert frame.surface is not None
-    assert frame.surface.pose_id == 8
+    assert [surface.pose_id for surface in frame.surfaces] == [8, 7]
     assert frame.live == 1
+
+
+def test_all_that_are_blended_follow() -> None:
+    """Two meshes with the shirt as it was: red as if there was one, not half of it."""
+    pictures = []
+    for copies in (1, 2):
+        here, viewer, shirt = Receiver(), OffscreenViewer(mode="live"), ChangingShirt()
+        meshes = [shirt.mesh, mesh_at(0.6)][:copies]
+        for mesh in meshes:
+            viewer.add_pose(mesh)
+        here.skeleton(pose_at(0.0), *(ReceivedPose(EPOCH, mesh) for mesh in meshes))
+        frame = shown_for(here, shirt, FADE_NS + 2 * FRAME_NS)[-1].frame
+        assert len(frame.others) == copies - 1
+        viewer.show(frame)
+        pictures.append(viewer.render([FRONT])[0][0])
+    alone, both = (reddish(picture).sum() for picture in pictures)
+    assert both > 0.95 * alone > 0
+
+
+def test_in_a_frame_one_mesh_at_most_is_worked_out_anew(shirt: ChangingShirt) -> None:
+    here = Receiver()
+    here.skeleton(pose_at(0.0), ReceivedPose(EPOCH, shirt.mesh), ReceivedPose(EPOCH, mesh_at(0.6)))
+    frames = [shown.frame.surfaces for shown in shown_for(here, shirt, SECOND_NS)]
+    new = [len(set(after) - set(before)) for before, after in pairwise(frames)]
+    assert max(new) == 1
+    assert sum(new) > SECOND_NS / PERIOD_NS
 
 
 def test_it_is_worked_out_a_few_times_a_second_however_many_packets_come(shirt: ChangingShirt) -> None:
     here = Receiver()
     here.skeleton(pose_at(0.0), ReceivedPose(EPOCH, shirt.mesh))
     shown = shown_for(here, shirt, SECOND_NS)
-    made = {id(s.frame.surface) for s in shown}
+    made = {surface for s in shown for surface in s.frame.surfaces}
     assert 5 <= len(made) <= SECOND_NS / PERIOD_NS
 
 
@@ -121,7 +152,7 @@ def test_maps_of_another_run_are_not_followed(shirt: ChangingShirt) -> None:
     shown_for(here, shirt, FADE_NS + 3 * FRAME_NS)
     frame = here.skeleton(pose_at(1.0), ReceivedPose(EPOCH + 1, shirt.mesh), epoch=EPOCH + 1).frame
     assert frame.pose_id == 7
-    assert (frame.surface, frame.live) == (None, 0)
+    assert (frame.surfaces, frame.live) == ((), 0)
 
 
 def test_without_maps_any_more_the_mesh_is_itself_again(shirt: ChangingShirt) -> None:

@@ -11,7 +11,7 @@ from common.body.skeleton_pose import forward_kinematics
 from common.body.skinning import link_motion
 from receiver.repository.pose_selection import PoseSelector, SelectionSettings
 from receiver.viewer.offscreen_viewer import OffscreenViewer
-from receiver.viewer.pose_blending import blended, shares
+from receiver.viewer.pose_blending import blended
 from receiver.viewer.viewer import MovedPose
 from scripts.fidelity import measuring_cameras
 from tests.capsule_person import SKELETON, capsule_person, pose_at, shown_frame
@@ -23,24 +23,16 @@ def picture(level: int, covered: slice):
     return colour, depth
 
 
-@pytest.mark.parametrize("live", [0.0, 0.25, 1.0])
-@pytest.mark.parametrize("others", [0, 1, 2, 7])
-def test_shares_are_equal_but_for_what_is_live_of_the_first(others: int, live: float) -> None:
-    of_each = shares(others, live)
-    assert of_each.sum() == pytest.approx(1)
-    np.testing.assert_allclose(of_each[1:], (1 - live) / (1 + others))
-
-
 def test_colour_is_the_mean_and_depth_there_where_half_of_them_show_something() -> None:
     pictures = [picture(100, slice(0, 3)), picture(40, slice(0, 2)), picture(10, slice(0, 5))]
-    colour, depth = blended(pictures, shares(2, 0))
+    colour, depth = blended(pictures)
     np.testing.assert_array_equal(colour[0, :, 0], [50, 50, 122, 173, 173, 255])
     np.testing.assert_allclose(depth[0], [1, 1, 1, 0, 0, 0])
 
 
 def test_one_picture_is_itself() -> None:
     alone = picture(100, slice(0, 3))
-    assert blended([alone], shares(0, 0)) is alone
+    assert blended([alone]) is alone
 
 
 class Poses:

@@ -218,7 +218,7 @@ async def test_what_maps_show_goes_once_to_pages_that_show_it_before_its_frame()
     layout = map_layout(SKELETON, 1000, 25.0)
     offsets = np.full((layout.height, layout.width, 4), 128, np.uint8)
     frame = shown_frame(PERSON, 0.0, 5)
-    frame = dataclasses.replace(frame, surface=LiveSurface(1, layout, offsets), live=0.5)
+    frame = dataclasses.replace(frame, surfaces=(LiveSurface(1, layout, offsets),), live=0.5)
     async with serve() as served, served.page() as of_mesh, served.page() as live:
         await live.socket.send_str("live")
         await until(lambda: served.viewer.wants_live)

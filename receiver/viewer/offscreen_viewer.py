@@ -14,7 +14,7 @@ from common.body.skinning import Skinning, animate
 from common.geometry.camera_model import Camera
 from common.geometry.point_splats import render_points
 from common.geometry.rasterizer import render
-from receiver.viewer.pose_blending import Picture, blended, shares
+from receiver.viewer.pose_blending import Picture, blended
 from receiver.viewer.viewer import MovedPose, ShownFrame, ViewerStatus, ViewMode
 
 if TYPE_CHECKING:
@@ -91,23 +91,21 @@ class OffscreenViewer:
         if (on_screen := self._on_screen) is None:
             return [_nobody(camera) for camera in cameras]
         frame, mesh, others = on_screen
-        pictures = [self._render_first(frame, mesh, cameras)]
-        pictures += [self._render_pose(other, moved.motion, cameras) for other, moved in others]
-        of_each = shares(len(others), frame.live if self._mode == "live" else 0)
-        return [blended(of_one_camera, of_each) for of_one_camera in zip(*pictures, strict=True)]
-
-    def _render_first(self, frame: ShownFrame, mesh: RiggedMesh, cameras: Sequence[Camera]) -> list[Picture]:
-        """The frame's own pose, which may follow maps."""
         assert frame.motion is not None  # as its pose is not
-        if self._mode != "live" or frame.surface is None or frame.links is None:
-            return self._render_pose(mesh, frame.motion, cameras)
-        vertices = animate(mesh, frame.motion, self._skinning)
-        moved, offsets = frame.surface.follow(frame.links, mesh.vertex_link, vertices, frame.live)
-        return [render_live(mesh, moved, offsets, camera) for camera in cameras]
+        moved = [(mesh, frame.motion), *((other, pose.motion) for other, pose in others)]
+        pictures = [self._render_pose(frame, *each, cameras) for each in moved]
+        return [blended(of_one_camera) for of_one_camera in zip(*pictures, strict=True)]
 
-    def _render_pose(self, mesh: RiggedMesh, motion: NDArray[np.float32], cameras: Sequence[Camera]) -> list[Picture]:
+    def _render_pose(
+        self, frame: ShownFrame, mesh: RiggedMesh, motion: NDArray[np.float32], cameras: Sequence[Camera]
+    ) -> list[Picture]:
+        """One of the frame's poses, which may follow maps."""
         vertices = animate(mesh, motion, self._skinning)
-        return [render(vertices, mesh.faces_drawn, mesh.mesh.surface, camera, BACKGROUND) for camera in cameras]
+        surface = next((surface for surface in frame.surfaces if surface.pose_id == mesh.pose_id), None)
+        if self._mode != "live" or surface is None or frame.links is None:
+            return [render(vertices, mesh.faces_drawn, mesh.mesh.surface, camera, BACKGROUND) for camera in cameras]
+        moved, offsets = surface.follow(frame.links, mesh.vertex_link, vertices, frame.live)
+        return [render_live(mesh, moved, offsets, camera) for camera in cameras]
 
     def _render_points(self, cameras: Sequence[Camera]) -> list[tuple[NDArray[np.uint8], NDArray[np.float32]]]:
         points, frame = self._points, self._newest

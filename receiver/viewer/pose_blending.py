@@ -15,36 +15,29 @@ from numpy.typing import NDArray
 Picture = tuple[NDArray[np.uint8], NDArray[np.float32]]
 
 
-def shares(others: int, live: float) -> NDArray[np.float32]:
-    """Of the first pose's picture and so many others' (1 + others,): equal ones, but what is ``live`` (0..1) of the
-    first, only that one shows."""
-    out = np.full(1 + others, (1 - live) / (1 + others), np.float32)
-    out[0] = 1 - out[1:].sum()
-    return out
+def blended(pictures: Sequence[Picture]) -> Picture:
+    """The mean of pictures (colour (H, W, 3) uint8, depth (H, W) float32 [m], 0 = nothing).
 
-
-def blended(pictures: Sequence[Picture], of_each: NDArray[np.float32]) -> Picture:
-    """The mean of pictures (colour (H, W, 3) uint8, depth (H, W) float32 [m], 0 = nothing) by their shares (N,).
-
-    Depth is that of the first picture that has any there, where at least half of them, by their shares, show something.
+    Depth is that of the first picture that has any there, where at least half of them show something.
     """
     if len(pictures) == 1:
         return pictures[0]
     colours = np.stack([colour for colour, _ in pictures])
     depths = np.stack([depth for _, depth in pictures])
     colour, depth = np.empty_like(colours[0]), np.empty_like(depths[0])
-    _blend(colours, depths, of_each, colour, depth)
+    _blend(colours, depths, colour, depth)
     return colour, depth
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
-def _blend(colours, depths, of_each, colour, depth):  # type: ignore[no-untyped-def]
+def _blend(colours, depths, colour, depth):  # type: ignore[no-untyped-def]
+    share = np.float32(1.0 / len(colours))
     for v in range(depth.shape[0]):
         for u in range(depth.shape[1]):
             covered, first = np.float32(0), np.float32(0)
             r = g = b = np.float32(0.5)
-            for n in range(len(of_each)):
-                share, z = of_each[n], depths[n, v, u]
+            for n in range(len(colours)):
+                z = depths[n, v, u]
                 r += share * colours[n, v, u, 0]
                 g += share * colours[n, v, u, 1]
                 b += share * colours[n, v, u, 2]

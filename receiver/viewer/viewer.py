@@ -47,10 +47,10 @@ class ShownFrame:
     ``capture_ns``: the sender's capture time of the skeleton [ns]. ``pose_id``: the candidate pose drawn; None while
     the repository is empty (then ``motion`` is None too and only the joints are known).
     ``motion`` (L, 3, 4) float32: T_world_link(now) · T_link_world(at capture), moves the mesh's world vertices.
-    ``others``: poses that it is blended with: the picture is the mean of all, but for what is ``live`` of this one.
+    ``others``: poses that it is blended with: the picture is the mean of all.
     ``joints`` (L, 3) float32 [m, world]: link origins. ``sigma``: distortion score σ of the drawn pose (nan: none).
     ``links`` (L, 3, 4) float32: T_world_link, moves points; None where nobody needs it.
-    ``surface``: what maps show beyond that mesh, None: nothing; ``live``: how much of it to show, 0..1.
+    ``surfaces``: what maps show beyond these poses' meshes; ``live``: how much of it to show, 0..1.
     ``region_sigma`` (R,) float32: its σ_r by region (``REGION_NAMES``; nan: not seen), None without a pose.
     ``fit_confidence``: 0..1. ``confidence`` (L,) float32: 0 = that link was not seen.
     ``age_ms``: time from capture to this call [ms], nan while the clock offset to the sender is unknown.
@@ -68,7 +68,7 @@ class ShownFrame:
     sigma: float
     links: NDArray[np.float32] | None = field(default=None, kw_only=True)
     others: tuple[MovedPose, ...] = field(default=(), kw_only=True)
-    surface: LiveSurface | None = field(default=None, kw_only=True)
+    surfaces: tuple[LiveSurface, ...] = field(default=(), kw_only=True)
     live: float = field(default=0.0, kw_only=True)
     region_sigma: NDArray[np.float32] | None = field(default=None, kw_only=True)
     fit_confidence: float
@@ -81,8 +81,9 @@ class ShownFrame:
             raise ValueError("a shown frame has a pose and its motion, or neither")
         if self.others and self.pose_id is None:
             raise ValueError("a shown frame has no pose, but others to blend it with")
-        if self.surface is not None and self.surface.pose_id != self.pose_id:
-            raise ValueError(f"a surface of pose {self.surface.pose_id} in a frame of pose {self.pose_id}")
+        drawn = {self.pose_id, *(other.pose_id for other in self.others)}
+        if strange := [surface.pose_id for surface in self.surfaces if surface.pose_id not in drawn]:
+            raise ValueError(f"surfaces of poses {strange} in a frame of poses {drawn}")
         if self.motion is not None and self.motion.shape != (LINK_COUNT, 3, 4):
             raise ValueError(f"motion: expected {(LINK_COUNT, 3, 4)}, got {self.motion.shape}")
         if self.links is not None and self.links.shape != (LINK_COUNT, 3, 4):

@@ -79,8 +79,8 @@ class WebViewer:
         self._points: LinkPoints | None = None
         self._points_message: bytes | None = None  # of these points, once a page needed it
         self._frame: bytes | None = None
-        self._surface: LiveSurface | None = None  # of that frame
-        self._surface_message: bytes | None = None  # of that surface, once a page needed it
+        self._surfaces: tuple[LiveSurface, ...] = ()  # of that frame
+        self._surface_messages: dict[LiveSurface, bytes] = {}  # of these, once a page needed them
         self._pose_on_screen: int | None = None
         self._status = encode_status(ViewerStatus())
         self._pages: set[_Page] = set()
@@ -125,8 +125,9 @@ class WebViewer:
     def show(self, frame: ShownFrame) -> None:
         """Newest wins: a page that is not ready for this frame will get a later one."""
         self._frame = encode_frame(frame)
-        if frame.surface is not self._surface:
-            self._surface, self._surface_message = frame.surface, None
+        messages = self._surface_messages
+        self._surfaces = frame.surfaces
+        self._surface_messages = {surface: messages[surface] for surface in frame.surfaces if surface in messages}
         self._pose_on_screen = frame.pose_id
         self._wake()
 
@@ -218,10 +219,13 @@ class WebViewer:
             page.points = self._points
             self._points_message = self._points_message or encode_points(self._points)
             await page.send(self._points_message)
-        if page.mode == "live" and self._surface is not None and page.surface is not self._surface:
-            page.surface = self._surface
-            self._surface_message = self._surface_message or encode_live(self._surface)
-            await page.send(self._surface_message)
+        if page.mode == "live":
+            lacking = [surface for surface in self._surfaces if surface not in page.surfaces]
+            page.surfaces = set(self._surfaces)
+            for surface in lacking:
+                if surface not in self._surface_messages:
+                    self._surface_messages[surface] = encode_live(surface)
+                await page.send(self._surface_messages[surface])
         if self._frame is not None and page.frame is not self._frame:
             page.frame = self._frame
             await page.send(page.frame)
@@ -264,7 +268,7 @@ class _Page:
         self.socket = socket
         self.mode = mode
         self.points: LinkPoints | None = None
-        self.surface: LiveSurface | None = None
+        self.surfaces: set[LiveSurface] = set()
         self.wake = asyncio.Event()
         self.poses: set[int] = set()
         self.frame: bytes | None = None

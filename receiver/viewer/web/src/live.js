@@ -1,4 +1,4 @@
-// The mesh on screen follows newer maps: what they show beyond it lies in a small picture of the links' cylinders, where
+// A mesh on screen follows newer maps: what they show beyond it lies in a small picture of the links' cylinders, where
 // each vertex finds its own, as in common/body/live_surface.py.
 
 import * as THREE from "three";
@@ -43,9 +43,7 @@ export const followingShader = /* glsl */ `
 
 export class LiveSurface {
   constructor() {
-    this.wanted = false;
-    this.newest = null;
-    this.loaded = null;
+    this.loaded = null; // the message that is on the GPU
     this.uniforms = {
       live: { value: 0 },
       outwardStep: { value: 0 },
@@ -56,28 +54,22 @@ export class LiveSurface {
     };
   }
 
-  /** What maps show beyond the mesh of one pose; a frame of that pose makes use of it. */
-  set(message) {
-    this.newest = message;
-  }
-
-  clear() {
-    this.newest = this.loaded = null;
-    this.uniforms.live.value = 0;
-  }
-
-  /** The pose on screen follows, its links being where the frame says. */
-  show({ poseId, live, links }) {
-    const follows = this.wanted && live > 0 && this.newest?.poseId === poseId;
+  /** The mesh follows by `live`, 0..1, what the message says, its links being where the frame has them; null: nothing. */
+  show(message, { live, links }) {
+    const follows = message !== null && live > 0;
     this.uniforms.live.value = follows ? live : 0;
     if (!follows) return;
-    if (this.loaded !== this.newest) this.load(this.newest);
+    if (this.loaded !== message) this.load(message);
     for (let link = 0; link < LINKS; link++) this.setInto(link, links.subarray(12 * link, 12 * link + 12));
+  }
+
+  dispose() {
+    this.uniforms.offsets.value?.dispose();
   }
 
   load(message) {
     const { offsets, size, place, outwardStep } = this.uniforms;
-    offsets.value?.dispose();
+    this.dispose();
     offsets.value = new THREE.DataTexture(message.offsets, message.width, message.height);
     offsets.value.needsUpdate = true;
     size.value.set(message.sizes);

@@ -51,7 +51,7 @@ const receiver = connect({
     setMode(mode);
   },
   live(message) {
-    person.live.set(message);
+    person.setSurface(message);
   },
   frame(frame) {
     newest = { ...frame, capturedAt: performance.now() - frame.ageMs };
@@ -79,7 +79,7 @@ function setMode(value) {
   if (mode !== "points") surface = mode;
   points.visible = mode === "points";
   person.visible = mode !== "points";
-  person.live.wanted = mode === "live";
+  person.follows = mode === "live";
   hud.setPointsMissing(mode === "points" && !points.any);
   stage.changed = true;
 }

@@ -6,7 +6,6 @@ import * as THREE from "three";
 import { followingShader, LiveSurface } from "./live.js";
 import { LINKS } from "./messages.js";
 
-const NOT_LIVE = { value: 0 };
 const SKINNINGS = ["rigid", "linear", "spherical"];
 
 const vertexShader = /* glsl */ `
@@ -63,16 +62,17 @@ export class Person {
     scene.add(this.group);
     this.meshes = new Map(); // of all poses; those in the group can be shown
     this.frame = null; // the last one to show
-    this.live = new LiveSurface();
+    this.surfaces = new Map(); // what maps show beyond the pose of that id: the newest message
+    this.follows = false; // whether that is wanted
     this.shown = []; // the meshes on screen, the best pose's first
     this.blends = true; // several, where a frame names several; else the best one alone
-    this.shared = { ...this.live.uniforms, skinning: { value: 0 }, presence: { value: 1 } };
+    this.shared = { skinning: { value: 0 }, presence: { value: 1 } };
   }
 
   /** The pose can be shown when its texture is decoded; by then it may have been removed. */
   async add(message) {
     const { poseId, jpeg } = message;
-    this.remove(poseId);
+    this.dispose(poseId);
     const mesh = meshOf(message, this.shared);
     this.meshes.set(poseId, mesh);
     const picture = await createImageBitmap(new Blob([jpeg], { type: "image/jpeg" }), { colorSpaceConversion: "none" });
@@ -82,7 +82,17 @@ export class Person {
     if (this.frame && [this.frame, ...this.frame.others].some((pose) => pose.poseId === poseId)) this.show(this.frame);
   }
 
+  /** What maps show beyond the mesh of one pose; frames with that pose make use of it. */
+  setSurface(message) {
+    this.surfaces.set(message.poseId, message);
+  }
+
   remove(poseId) {
+    this.surfaces.delete(poseId);
+    this.dispose(poseId);
+  }
+
+  dispose(poseId) {
     const mesh = this.meshes.get(poseId);
     if (!mesh) return;
     this.meshes.delete(poseId);
@@ -90,14 +100,15 @@ export class Person {
     this.group.remove(mesh);
     mesh.geometry.dispose();
     mesh.material.uniforms.atlas.value?.dispose();
+    mesh.userData.live.dispose();
     mesh.material.dispose();
   }
 
   clear() {
     for (const poseId of [...this.meshes.keys()]) this.remove(poseId);
+    this.surfaces.clear();
     this.frame = null;
     this.shown = [];
-    this.live.clear();
   }
 
   /** Shows the frame's poses, nobody if it has none; while its first one is not ready yet the last stays as it was. */
@@ -105,12 +116,10 @@ export class Person {
     const { poseId, others } = frame;
     this.frame = frame;
     if (poseId !== null && !this.meshes.get(poseId)?.parent) return;
-    this.live.show(frame);
     const moved = poseId === null ? [] : [frame, ...(this.blends ? others : [])];
     const ready = moved.filter((pose) => this.meshes.get(pose.poseId)?.parent);
-    const ofOthers = (1 - this.live.uniforms.live.value) / ready.length; // as receiver/viewer/pose_blending.py
     for (const mesh of this.meshes.values()) mesh.visible = false;
-    this.shown = ready.map((pose, n) => this.move(pose, n ? ofOthers : 1 - (ready.length - 1) * ofOthers));
+    this.shown = ready.map((pose) => this.move(pose, 1 / ready.length));
   }
 
   move({ poseId, motion }, share) {
@@ -119,7 +128,7 @@ export class Person {
     uniforms.motion.value.set(motion);
     uniforms.turn.value.forEach((turn, link) => turn.setFromRotationMatrix(matrixOf(motion, link)));
     uniforms.share.value = share;
-    uniforms.live = poseId === this.frame.poseId ? this.live.uniforms.live : NOT_LIVE;
+    mesh.userData.live.show(this.follows ? (this.surfaces.get(poseId) ?? null) : null, this.frame);
     mesh.visible = true;
     return mesh;
   }
@@ -146,6 +155,7 @@ function meshOf({ boxMin, boxSize, positions, uv, skin, joints, indices }, share
   geometry.setAttribute("skin", onGpuOnly(new THREE.BufferAttribute(skin, 4)));
   geometry.setIndex(onGpuOnly(new THREE.BufferAttribute(indices, 1)));
   geometry.boundingSphere = new THREE.Sphere(); // else three.js reads every vertex, to sort one mesh
+  const live = new LiveSurface();
   const material = new THREE.ShaderMaterial({
     glslVersion: THREE.GLSL3,
     side: THREE.DoubleSide, // through a gap one sees the inside of the cloth, not the room
@@ -153,6 +163,7 @@ function meshOf({ boxMin, boxSize, positions, uv, skin, joints, indices }, share
     fragmentShader,
     uniforms: {
       ...shared,
+      ...live.uniforms,
       motion: { value: new Float32Array(12 * LINKS) },
       turn: { value: Array.from({ length: LINKS }, () => new THREE.Quaternion()) },
       share: { value: 1 },
@@ -165,6 +176,7 @@ function meshOf({ boxMin, boxSize, positions, uv, skin, joints, indices }, share
   const mesh = new THREE.Mesh(geometry, material);
   mesh.frustumCulled = false; // its bounds are those of the capture, not of now
   mesh.visible = false;
+  mesh.userData.live = live;
   return mesh;
 }
 
