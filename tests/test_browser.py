@@ -194,21 +194,30 @@ def following(person: RiggedMesh, time_s: float, strength: float) -> ShownFrame:
     wider[shirt] += 0.02 * (vertices[shirt] - vertices[shirt].mean(axis=0)) / 0.15
     layout = map_layout(SKELETON, 10_000, 60.0)
     maps = closed(layout, project_points(layout, T_world_link, person.vertex_link, wider, newer))
-    surface = live_surface(7, layout, maps, T_world_link, person.vertex_link, vertices, colours)
+    surface = live_surface(person.pose_id, layout, maps, T_world_link, person.vertex_link, vertices, colours)
     return dataclasses.replace(frame, surfaces=(surface,), live=strength)
 
 
-@pytest.mark.parametrize("strength", [1.0, 0.4])
-async def test_page_and_offscreen_renderer_agree_on_a_live_surface(strength: float) -> None:
-    """The same mesh tinted and moved by the page's shaders and by the offscreen renderer; L on the page switches it."""
+@pytest.mark.parametrize(("strength", "count"), [(1.0, 1), (0.4, 1), (1.0, 2)])
+async def test_page_and_offscreen_renderer_agree_on_a_live_surface(strength: float, count: int) -> None:
+    """The same meshes tinted and moved by the page's shaders and by the offscreen renderer; L on the page switches it.
+    Of two, whose colours are each other's inverse, both follow."""
     person = captured_person(7)
-    frame = following(person, 2.3, strength)
-    async with receiver() as (viewer, url), open_page(url, 800, 600) as page:
-        viewer.add_pose(person)
+    inverse = dataclasses.replace(person.mesh, texture=255 - person.mesh.texture)
+    meshes = [person, dataclasses.replace(person, pose_id=8, mesh=inverse)][:count]
+    frame, *others = [following(mesh, 2.3, strength) for mesh in meshes]
+    for other in others:
+        assert other.motion is not None
+        moved, surfaces = MovedPose(8, other.motion), frame.surfaces + other.surfaces
+        frame = dataclasses.replace(frame, others=(moved,), surfaces=surfaces)
+    shirt = SHIRT if count == 1 else (127, 127, 127)
+    async with receiver() as (viewer, url), open_page(url + "?blend", 800, 600) as page:
+        for mesh in meshes:
+            viewer.add_pose(mesh)
         viewer.set_status(RECEIVING)
         viewer.show(frame)
         await page.press("h")
-        plain = await photograph_when(page, lambda p: coloured(p, SHIRT).sum() > 500)
+        plain = await photograph_when(page, lambda p: coloured(p, shirt).sum() > 500)
         assert not viewer.wants_live
         await page.press("l")
         await until(lambda: viewer.wants_live)
@@ -218,7 +227,8 @@ async def test_page_and_offscreen_renderer_agree_on_a_live_surface(strength: flo
     errors = {}
     for mode in get_args(ViewMode)[:2]:
         offscreen = OffscreenViewer(mode=mode)
-        offscreen.add_pose(person)
+        for mesh in meshes:
+            offscreen.add_pose(mesh)
         offscreen.show(frame)
         for name, seen in (("page plain", plain), ("page live", picture)):
             errors[mode, name] = difference_db(seen, offscreen.render([camera])[0][0])
