@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from typing import get_args
+
 import numpy as np
 import pytest
 
-from common.body.body_regions import REGION_INDEX, REGION_LINKS
+from common.body.body_regions import REGION_INDEX, REGION_LINKS, ScoreForm
 from common.body.depth_mesher import mesh_view
 from common.body.joint_edges import FIXED_EDGE_M, joint_edges
 from common.body.rigged_mesh import (
@@ -25,6 +27,7 @@ from tests.capsule_views import arms_down_by, capsule_views, captured, links_of,
 ANGLE_RAD = 1.35  # hands at the thighs
 MESH = captured(ANGLE_RAD, pose_id=7, capture_ns=123)
 REGIONS = vertex_regions(MESH.mesh.vertices, MESH.vertex_link, SKELETON, MESH.T_link_world)
+ALL = 10**9
 
 
 def all_edges() -> set[tuple[int, int]]:
@@ -63,11 +66,26 @@ def test_link_frames_are_those_of_the_capture() -> None:
 
 
 def test_joint_edges_are_the_edges_between_links_each_once() -> None:
-    ends = MESH.joint_edges.vertices
-    found = [(min(a, b), max(a, b)) for a, b in ends.tolist()]
+    edges = joint_edges(MESH.mesh.vertices, MESH.mesh.faces, REGIONS, MESH.T_link_world, most=ALL)
+    found = [(min(a, b), max(a, b)) for a, b in edges.vertices.tolist()]
     expected = {(a, b) for a, b in all_edges() if MESH.vertex_link[a] != MESH.vertex_link[b]}
-    assert len(found) == len(set(found)) == len(MESH.joint_edges)
+    assert len(found) == len(set(found)) == len(edges)
     assert set(found) == expected
+
+
+@pytest.mark.parametrize("form", get_args(ScoreForm))
+def test_of_many_joint_edges_a_sample_of_each_seam_is_kept(form: ScoreForm) -> None:
+    every, sample = (
+        joint_edges(MESH.mesh.vertices, MESH.mesh.faces, REGIONS, MESH.T_link_world, form, most) for most in (ALL, 500)
+    )
+    assert 400 < len(sample) < 600 < len(every) / 2
+    np.testing.assert_array_equal(sample.pair_regions, every.pair_regions)
+    assert set(map(tuple, sample.vertices.tolist())) < set(map(tuple, every.vertices.tolist()))
+    step = -(-len(every) // 500)
+    np.testing.assert_array_equal(np.diff(sample.pair_starts), -(-np.diff(every.pair_starts) // step))
+    seen = every.region_lengths > 0
+    shares = sample.region_lengths[seen] / every.region_lengths[seen]
+    assert abs(shares.mean() * step - 1) < 0.15
 
 
 def test_joint_edges_are_grouped_by_region_pair() -> None:
@@ -100,7 +118,7 @@ def test_an_edge_counts_in_both_its_regions() -> None:
 
 def test_what_eq_1_divides_by_can_be_all_edges_or_a_fixed_length() -> None:
     every, fixed = (
-        joint_edges(MESH.mesh.vertices, MESH.mesh.faces, REGIONS, MESH.T_link_world, form)
+        joint_edges(MESH.mesh.vertices, MESH.mesh.faces, REGIONS, MESH.T_link_world, form, ALL)
         for form in ("all-edges", "fixed-length")
     )
     ends = np.array(sorted(all_edges()))
