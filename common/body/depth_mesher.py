@@ -93,17 +93,21 @@ def _placed(pixels, ideal, depths_mm, to_world, height, width):  # type: ignore[
 
 @njit(nogil=True, cache=True, error_model="numpy")
 def _smooth(depth_mm, radius, range_mm):  # type: ignore[no-untyped-def]
-    """Band by band, which the cache holds, and pair by pair: the innermost loop, over a band as one row, is one
-    the compiler can vectorise. A margin of background keeps what is added beyond an edge from counting."""
+    """Band by band, of its columns in which there is anybody, and pair by pair: the innermost loop, over a band as one
+    row, is one the compiler can vectorise. A margin of background keeps what is added beyond an edge from counting."""
     h, w = depth_mm.shape
-    columns, above_all = w + 2 * radius, radius + 1
-    padded = np.zeros((h + 2 * above_all, columns), np.float32)
-    padded[above_all : above_all + h, radius : radius + w] = depth_mm
-    depth, out = padded.ravel(), np.zeros((h, w), np.float32)
-    totals, counts = np.empty(_BAND_ROWS * columns, np.float32), np.empty(_BAND_ROWS * columns, np.float32)
+    margin, out = radius + 1, np.zeros((h, w), np.float32)
+    room = np.empty((_BAND_ROWS + 2 * margin) * (w + 2 * radius), np.float32)
+    totals, counts = np.empty(len(room), np.float32), np.empty(len(room), np.float32)
     for top in range(0, h, _BAND_ROWS):
         rows = min(_BAND_ROWS, h - top)
-        start, end = (top + above_all) * columns, (top + above_all + rows) * columns
+        left, right = _occupied(depth_mm[top : top + rows])
+        if left == right:
+            continue
+        columns = right - left + 2 * radius
+        depth = room[: (rows + 2 * margin) * columns]
+        _cut_out(depth_mm, top - margin, left - radius, depth.reshape(rows + 2 * margin, columns))
+        start, end = margin * columns, (margin + rows) * columns
         centre, total, count = depth[start:end], totals[: end - start], counts[: end - start]
         total[:] = centre
         count[:] = np.float32(1.0)
@@ -115,8 +119,36 @@ def _smooth(depth_mm, radius, range_mm):  # type: ignore[no-untyped-def]
                 )
         for p in range(end - start):
             total[p] = total[p] / count[p] if centre[p] > 0 else np.float32(0.0)
-        out[top : top + rows] = total.reshape(rows, columns)[:, radius : radius + w]
+        out[top : top + rows, left:right] = total.reshape(rows, columns)[:, radius : columns - radius]
     return out
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _occupied(depth_mm):  # type: ignore[no-untyped-def]
+    """From the first column with a reading to the one after the last; two of the same where there is none."""
+    h, w = depth_mm.shape
+    left, right = w, 0
+    for v in range(h):
+        for u in range(left):
+            if depth_mm[v, u]:
+                left = u
+                break
+        for u in range(w - 1, right - 1, -1):
+            if depth_mm[v, u]:
+                right = u + 1
+                break
+    return min(left, right), right
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _cut_out(depth_mm, top, left, out):  # type: ignore[no-untyped-def]
+    """``depth_mm`` from ``top`` and ``left`` on, 0 beyond its edges."""
+    h, w = depth_mm.shape
+    for v in range(out.shape[0]):
+        for u in range(out.shape[1]):
+            y, x = top + v, left + u
+            inside = 0 <= y < h and 0 <= x < w
+            out[v, u] = np.float32(depth_mm[y, x]) if inside else np.float32(0.0)
 
 
 @njit(nogil=True, cache=True, error_model="numpy")

@@ -1,8 +1,9 @@
 """A person's depth in bytes, off by at most a stated error: near-lossless predictive coding as in JPEG-LS (T.87).
 
-In reading order, each pixel says whether it is the person's, under the pattern of its neighbours. A reading is
-predicted from those to the left and above as the other end has them, so that errors do not add up; what it is off, in
-steps of twice the error and one, is coded under how far its neighbours were off (``arithmetic_coder``).
+In reading order, each pixel says whether it is the person's, under the pattern of its neighbours; where all of these
+are or none is, one bit speaks for as long as that goes on. A reading is predicted from those to the left and above as
+the other end has them, so that errors do not add up; what it is off, in steps of twice the error and one, is coded under
+how far its neighbours were off (``arithmetic_coder``).
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from common.wire.header import WireError, checked_int
 DEPTH_ERROR_MAX_MM = 16
 
 _PATTERNS = 1024  # of ten neighbours
+_ALL = _PATTERNS - 1
 _MOST_MM = 0xFFFF
 _UNARY = 10  # up to here a magnitude is counted bit by bit
 _LEVELS = 8  # of how far the neighbours were off
@@ -69,18 +71,18 @@ def _predicted(left, above, corner, beyond, last, weights):  # type: ignore[no-u
 
 
 @njit(nogil=True, cache=True)
-def _end_of_nothing(above, second, u):  # type: ignore[no-untyped-def]
-    """Where the stretch ends whose pixels, from ``u`` on, have nobody around them, if ``u`` has not."""
-    while u < len(above) - 2 and not above[u + 2] and not second[u + 1]:
+def _end_of_stretch(above, second, u, person):  # type: ignore[no-untyped-def]
+    """Where the stretch from ``u`` on ends around whose pixels, above them, all are ``person`` or none is."""
+    while u < len(above) - 2 and (above[u + 2] > 0) == person and (second[u + 1] > 0) == person:
         u += 1
     return u
 
 
 @njit(nogil=True, cache=True)
-def _anybody(depth_mm, v, start, end):  # type: ignore[no-untyped-def]
-    """Whether a stretch of a row has any reading."""
+def _interrupted(depth_mm, v, start, end, person):  # type: ignore[no-untyped-def]
+    """Whether a stretch of a row is not all ``person``, or not all nobody."""
     for u in range(start, end):  # noqa: SIM110
-        if depth_mm[v, u]:
+        if (depth_mm[v, u] > 0) != person:
             return True
     return False
 
@@ -106,7 +108,7 @@ def _code(depth_mm, error_mm, stream, decoding):  # type: ignore[no-untyped-def]
     """Writes ``depth_mm`` (h, w), which becomes what the other end will have, to ``stream``, or reads it from there;
     the number of bytes."""
     height, width = depth_mm.shape
-    coder, outline = open_coder(stream, decoding), open_contexts(_PATTERNS + 1)
+    coder, outline = open_coder(stream, decoding), open_contexts(_PATTERNS + 2)
     readings = open_contexts(_LEVELS * _PER_LEVEL + _LENGTHS + 1)
     step, last = np.int64(2 * error_mm + 1), np.int64(2000)
     per_step, weights = 1.0 / step, _FINE if error_mm < _COARSE_MM else _COARSE
@@ -116,33 +118,40 @@ def _code(depth_mm, error_mm, stream, decoding):  # type: ignore[no-untyped-def]
         here, above, second = rows[v % 3], rows[(v - 1) % 3], rows[(v - 2) % 3]
         off, off_above = offs[v % 2], offs[(v - 1) % 2]
         here[:], off[:] = 0, 0
-        u = one_by_one_to = 2
+        u = one_by_one_to = person_to = 2
         while u < width + 2:
-            pattern = (
-                np.int64(here[u - 1] > 0)
-                | np.int64(here[u - 2] > 0) << 1
-                | np.int64(above[u] > 0) << 2
-                | np.int64(above[u - 1] > 0) << 3
-                | np.int64(above[u + 1] > 0) << 4
-                | np.int64(above[u - 2] > 0) << 5
-                | np.int64(above[u + 2] > 0) << 6
-                | np.int64(second[u] > 0) << 7
-                | np.int64(second[u - 1] > 0) << 8
-                | np.int64(second[u + 1] > 0) << 9
-            )
-            if pattern == 0 and u >= one_by_one_to:
-                end = _end_of_nothing(above, second, u)
-                anybody = not decoding and _anybody(depth_mm, v, u - 2, end - 2)
-                anybody, coder = code_bit(coder, stream, decoding, outline, _PATTERNS, np.int64(anybody))
-                if not anybody:
-                    u = end
-                    continue
-                one_by_one_to = end
             value = np.int64(depth_mm[v, u - 2])
-            person, coder = code_bit(coder, stream, decoding, outline, pattern, np.int64(value > 0))
+            if u >= person_to:
+                pattern = (
+                    np.int64(here[u - 1] > 0)
+                    | np.int64(here[u - 2] > 0) << 1
+                    | np.int64(above[u] > 0) << 2
+                    | np.int64(above[u - 1] > 0) << 3
+                    | np.int64(above[u + 1] > 0) << 4
+                    | np.int64(above[u - 2] > 0) << 5
+                    | np.int64(above[u + 2] > 0) << 6
+                    | np.int64(second[u] > 0) << 7
+                    | np.int64(second[u - 1] > 0) << 8
+                    | np.int64(second[u + 1] > 0) << 9
+                )
+                if u >= one_by_one_to and (pattern == 0 or pattern == _ALL):
+                    person = pattern == _ALL
+                    end = _end_of_stretch(above, second, u, person)
+                    mixed = not decoding and _interrupted(depth_mm, v, u - 2, end - 2, person)
+                    mixed, coder = code_bit(coder, stream, decoding, outline, _PATTERNS + person, np.int64(mixed))
+                    if mixed:
+                        one_by_one_to = end
+                    elif person:
+                        person_to = end
+                    else:
+                        u = end
+                        continue
+            if u >= person_to:
+                somebody, coder = code_bit(coder, stream, decoding, outline, pattern, np.int64(value > 0))
+                if not somebody:
+                    u += 1
+                    continue
             u += 1
-            if not person:
-                continue
             predicted = _predicted(here[u - 2], above[u - 1], above[u - 2], above[u], last, weights)
             wrong = value - predicted
             magnitude = np.int64((abs(wrong) + error_mm + 0.5) * per_step)
