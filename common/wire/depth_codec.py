@@ -2,8 +2,8 @@
 
 In reading order, each pixel says whether it is the person's, under the pattern of its neighbours; where all of these
 are or none is, one bit speaks for as long as that goes on. A reading is predicted from those to the left and above as
-the other end has them, so that errors do not add up; what it is off, in steps of twice the error and one, is coded under
-how far its neighbours were off (``arithmetic_coder``).
+the other end has them, so that errors do not add up; what it is off, in steps of twice the error and one, is coded
+under how far its neighbours were off (``arithmetic_coder``).
 """
 
 from __future__ import annotations
