@@ -27,7 +27,7 @@ class RepositorySettings:
     search: Literal["threshold", "exhaustive"] = "exhaustive"
     hold: bool = False
     hysteresis: float = 0.0
-    blended: int = 3
+    blended: int = 5
     search_ms: float = 5.0
     equal_share: float = 0.5
     withhold_factor: float = 6.0

@@ -33,7 +33,7 @@ class SelectionSettings:
     search: Literal["threshold", "exhaustive"] = "exhaustive"
     hold: bool = False
     hysteresis: float = 0.0
-    blended: int = 3
+    blended: int = 5
     start_threshold: float = START_THRESHOLD
     memory_frames: int = 300
     withhold_factor: float = 6.0
