@@ -3,7 +3,8 @@
 Needs root and Linux (network namespaces). Real Zenoh sessions, windows, chunks and reports of the daemons run in two
 processes; between them is a path with the case's rate, delay and faults. The delay of the idle path is measured in the
 same run, before meshes begin. Figures are medians of ``--runs``; a run in which the emulator itself was late by more
-than 2 ms (99th percentile) is void and done again. Rates are of IP packets, goodput counts bytes of chunks.
+than 2 ms (99th percentile) is void and done again. Rates are of IP packets, goodput counts bytes of chunks. TCP's
+congestion control is CUBIC, Linux' own default, where the case does not name another.
 ``--clips`` names cases (``10M/50ms/secure``), or all that begin so (``10M``).
 """
 
@@ -17,7 +18,7 @@ from pathlib import Path
 from statistics import median
 
 from scripts.link_model import BurstLoss, LinkConditions
-from scripts.network_emulation import EmulatorReport, unavailable
+from scripts.network_emulation import CongestionControl, EmulatorReport, unavailable
 from scripts.network_run import MS, NS, Change, NetworkCase, Seen, percentile, run_case
 from scripts.run_bench import Row
 
@@ -28,9 +29,10 @@ Figures = dict[str, tuple[float, str]]  # metric → value, unit
 Judge = Callable[[NetworkCase, Seen], Figures]
 
 
-def ten(kind: str, **faults: object) -> NetworkCase:
+def ten(kind: str, congestion_control: CongestionControl = "cubic", **faults: object) -> NetworkCase:
     """10 Mbit/s, 50 ms there and back, 200 ms of queue."""
-    return NetworkCase(LinkConditions(10e6, 25, **faults), kind)  # type: ignore[arg-type]
+    path = LinkConditions(10e6, 25, **faults)  # type: ignore[arg-type]
+    return NetworkCase(path, kind, congestion_control=congestion_control)  # type: ignore[arg-type]
 
 
 def steady(case: NetworkCase, seen: Seen) -> Figures:
@@ -130,6 +132,7 @@ CASES: dict[str, tuple[NetworkCase, Judge]] = {
     "10M/50ms/secure": (NetworkCase(LinkConditions(10e6, 25), "secure", seconds=25), steady),
     "10M/50ms/tcp": (NetworkCase(LinkConditions(10e6, 25), "tcp", seconds=25), steady),
     "10M/50ms/tcp-reno": (NetworkCase(LinkConditions(10e6, 25), "tcp", congestion_control="reno"), steady),
+    "10M/50ms/tcp-bbr": (NetworkCase(LinkConditions(10e6, 25), "tcp", seconds=25, congestion_control="bbr"), steady),
     "1M/50ms/tcp": (NetworkCase(LinkConditions(1e6, 25), "tcp"), steady),
     "1M/50ms/secure": (NetworkCase(LinkConditions(1e6, 25), "secure"), steady),
     "100M/20ms/tcp": (NetworkCase(LinkConditions(100e6, 10), "tcp"), steady),
@@ -138,6 +141,8 @@ CASES: dict[str, tuple[NetworkCase, Judge]] = {
     "loss1/10M/secure": (ten("secure", loss=0.01), steady),
     "loss5/10M/secure": (ten("secure", loss=0.05), steady),
     "burst/10M/secure": (ten("secure", burst=BurstLoss(0.01, 0.4)), steady),
+    "loss1-bbr/10M/secure": (ten("secure", loss=0.01, congestion_control="bbr"), steady),
+    "burst-bbr/10M/secure": (ten("secure", burst=BurstLoss(0.01, 0.4), congestion_control="bbr"), steady),
     "loss20/10M/secure": (ten("secure", loss=0.2), steady),
     "jitter/10M/secure": (ten("secure", jitter_ms=10, reorder=True, duplicates=0.01), steady),
     "bufferbloat/10M/secure": (ten("secure", queue_ms=2000), steady),
@@ -212,7 +217,7 @@ _P50, _P99 = "skeleton_delay_over_idle_p50_ms", "skeleton_delay_over_idle_p99_ms
 # What is to be reached: at most, but for shares of goodput, which are at least.
 GOALS: dict[tuple[str, str], float] = {
     **{(f"10M/50ms/{kind}", metric): goal
-       for kind in ("secure", "tcp", "tcp-reno")
+       for kind in ("secure", "tcp", "tcp-reno", "tcp-bbr")
        for metric, goal in ((_P50, 15), (_P99, 40), ("goodput_share", 0.9))},
     **{(f"1M/50ms/{kind}", metric): goal
        for kind in ("secure", "tcp") for metric, goal in ((_P99, 60), ("goodput_share", 0.8))},
