@@ -59,7 +59,7 @@ class NetworkCase:
     download_s: tuple[float, float] | None = None
     back: LinkConditions | None = None
     mtu: int = 1500
-    congestion_control: Literal["reno", "bbr", "cubic"] = "cubic"  # Linux' own default
+    congestion_control: Literal["reno", "bbr", "cubic"] = "reno"  # namespaces may have it on every host
 
 
 @dataclass(frozen=True, slots=True)
