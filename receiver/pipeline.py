@@ -160,16 +160,20 @@ class AnimationPath:
         if selection.withheld and self._shown is not None and self._shown.pose_id in self._repository.pose_ids:
             return replace(self._shown, withheld=True, links=T_world_link[:, :3])  # points are never withheld
         self._repository.count_use(selection.pose_id)
-        mesh = self._repository.get(selection.pose_id)
-        meshes = [other for other in map(self._repository.get, selection.others) if other is not None]
+        mesh = self._mesh(selection.pose_id)
+        meshes = [self._mesh(pose_id) for pose_id in selection.others]
         frame = _shown_frame(packet, mesh, T_world_link, selection.sigma)
         others = tuple(MovedPose(other.pose_id, link_motion(other, T_world_link)) for other in meshes)
-        assert mesh is not None
         assert frame.motion is not None
         moved = [(mesh, frame.motion), *((other, pose.motion) for other, pose in zip(meshes, others, strict=True))]
         surfaces, live = self.live.surfaces(moved, T_world_link, packet.epoch, packet.capture_ns)
         self._shown = replace(frame, others=others, surfaces=surfaces, live=live)
         return self._shown
+
+    def _mesh(self, pose_id: int) -> RiggedMesh:
+        mesh = self._repository.get(pose_id)
+        assert mesh is not None
+        return mesh
 
     def _select(self, T_world_link: NDArray[np.float32]) -> Selection | None:
         begin_ns = self._clock.now_ns()

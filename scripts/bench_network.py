@@ -3,8 +3,8 @@
 Needs root and Linux (network namespaces). Real Zenoh sessions, windows, chunks and reports of the daemons run in two
 processes; between them is a path with the case's rate, delay and faults. The delay of the idle path is measured in the
 same run, before meshes begin. Figures are medians of ``--runs``; a run in which the emulator itself was late by more
-than 2 ms (99th percentile) is void and done again. Rates are of IP packets, goodput counts bytes of chunks. TCP's
-congestion control is Reno's, which CUBIC's, Linux' own default, is on such paths, where the case does not name another.
+than 2 ms (99th percentile) is void and done again. Rates are of IP packets, goodput counts bytes of chunks. TCP
+goes by Reno where the case does not name another; on such paths CUBIC, Linux' own default, does the same.
 ``--clips`` names cases (``10M/50ms/secure``), or all that begin so (``10M``).
 """
 

@@ -22,6 +22,7 @@ from common.geometry.camera_model import Camera
 from common.wire.body_message import quantized_skeleton
 from common.wire.residual_packet import decode_residual_header
 from common.wire.skeleton_packet import quantized_pose
+from receiver.live_path import Moved
 from receiver.residual_decoder import ResidualDecoder, ResidualMaps
 from receiver.viewer.offscreen_viewer import render_live
 from receiver.viewer.pose_blending import blended
@@ -29,7 +30,7 @@ from scripts.capture_files import CapturedFrame
 from scripts.fidelity import Picture
 from scripts.fidelity_capture import FRAME_NS, FRAME_RATE_HZ
 from scripts.fidelity_link import ByteLink
-from scripts.fidelity_methods import Dispose, Moved, Screen, posed
+from scripts.fidelity_methods import Dispose, Screen, posed
 from sender.pipeline import BODY_CHANGE_M
 from sender.reconstruction.foreground_points import PointSampler
 from sender.residual_encoder import LevelControl, ResidualEncoder, ResidualFrame, ResidualSettings

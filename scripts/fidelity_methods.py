@@ -23,6 +23,7 @@ from common.runtime.stage_timer import StageTimer
 from common.wire.candidate_pose import CandidatePose, encode_candidate_pose
 from common.wire.skeleton_packet import SkeletonPacket
 from receiver.config import RepositorySettings
+from receiver.live_path import Moved
 from receiver.pipeline import AnimationPath, ReceivedPose, SkeletonToShow, mesh_of
 from receiver.viewer.pose_blending import blended
 from scripts.capture_files import CapturedFrame
@@ -84,9 +85,6 @@ def encoded_candidate(
 class _NoClock:
     def now_ns(self) -> int:
         return 0
-
-
-Moved = tuple[RiggedMesh, NDArray[np.float32]]  # a mesh and its links' motion
 
 
 def blended_picture(moved: list[Moved], cameras: list[Camera]) -> list[Picture]:

@@ -19,7 +19,7 @@ from typing import Any, Literal
 from scripts.link_emulator import ADDRESSES
 from scripts.link_model import LinkConditions
 from scripts.make_certificates import new_authority, new_certificate, write_site
-from scripts.network_emulation import EmulatedNetwork, EmulatorReport, Side, emulated_network
+from scripts.network_emulation import CongestionControl, EmulatedNetwork, EmulatorReport, Side, emulated_network
 from scripts.network_probe import ProbeSettings
 
 Kind = Literal["tcp", "secure"]
@@ -59,7 +59,7 @@ class NetworkCase:
     download_s: tuple[float, float] | None = None
     back: LinkConditions | None = None
     mtu: int = 1500
-    congestion_control: Literal["reno", "bbr", "cubic"] = "reno"  # namespaces may have it on every host
+    congestion_control: CongestionControl = "reno"  # namespaces may have it on every host
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,7 +11,7 @@ from common.body.rigging import Segmentation, Views
 from common.runtime.http_settings import HttpSettings
 from common.transport.channels import check_name
 from common.transport.link_settings import LinkSettings
-from common.wire.view_quality import ViewQuality
+from common.wire.view_quality import DEPTH_ERROR_MAX_MM, ViewQuality
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,8 +102,8 @@ class CandidateSettings:
             if not 20 <= getattr(self, name) <= 100:
                 raise ValueError(f"{name}: {getattr(self, name)} is outside 20..100")
         for name in ("depth_error_mm", "thin_depth_error_mm"):
-            if not 0 <= getattr(self, name) <= 16:
-                raise ValueError(f"{name}: {getattr(self, name)} is outside 0..16")
+            if not 0 <= getattr(self, name) <= DEPTH_ERROR_MAX_MM:
+                raise ValueError(f"{name}: {getattr(self, name)} is outside 0..{DEPTH_ERROR_MAX_MM}")
         if not 0 <= self.fused_frames <= 30:
             raise ValueError(f"fused_frames: {self.fused_frames} is outside 0..30")
         region_weights(self.region_weights)

@@ -13,8 +13,9 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import array_shapes, arrays
 from scipy.io import loadmat
 
-from common.wire.depth_codec import DEPTH_ERROR_MAX_MM, decode_depth, encode_depth
+from common.wire.depth_codec import decode_depth, encode_depth
 from common.wire.header import WireError
+from common.wire.view_quality import DEPTH_ERROR_MAX_MM
 from scripts.rvl import encode_rvl, in_steps
 
 GOLDEN = "9c248f3582a795f3500b0da7027009254afcd6"
@@ -105,6 +106,34 @@ def test_fewer_or_more_bytes_than_the_pixels_take_are_refused() -> None:
     for wrong in (b"", data[: len(data) // 2], data + b"\0"):
         with pytest.raises(WireError, match=r"depth: \d+ bytes, its pixels take"):
             decode_depth(wrong, 96, 64, 1)
+
+
+@pytest.mark.parametrize("pattern", [[1], [0xFFFF], [0, 0xFFFF], [1, 0xFFFF], [0, 1, 0xFFFF], [1, 30_000, 9, 0xFFFF]])
+def test_the_worst_depth_there_is_fits(pattern: list[int]) -> None:
+    depth_mm = np.resize(np.array(pattern, np.uint16), (31, 33))
+    np.random.default_rng(0).shuffle(depth_mm.ravel())
+    assert off(depth_mm, 0).max() == 0
+    assert len(encode_depth(depth_mm, 0)) < 71 * depth_mm.size / 4
+
+
+def test_bytes_that_end_early_are_refused_before_all_is_decoded() -> None:
+    whole = encode_depth(ball(400, 300), 1)
+    with pytest.raises(WireError, match="its pixels take") as refused:
+        decode_depth(whole[:100], 400, 300, 1)
+    assert int(str(refused.value).split()[-1]) < len(whole) / 10
+
+
+@settings(deadline=None)
+@given(st.lists(st.tuples(st.integers(5, 400), st.integers(0, 255)), min_size=1, max_size=4))
+def test_changed_bytes_are_refused_or_other_depth(changes: list[tuple[int, int]]) -> None:
+    data = bytearray(encode_depth(ball(40, 30), 1))
+    for place, byte in changes:
+        data[place % len(data)] = byte
+    try:
+        depth_mm = decode_depth(bytes(data), 40, 30, 1)
+    except WireError:
+        return
+    assert off(depth_mm, 0).max() == 0
 
 
 @settings(deadline=None, max_examples=300)

@@ -3,19 +3,24 @@
 from __future__ import annotations
 
 from collections import deque
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
 import pytest
 
 from common.body.rigged_mesh import RiggedMesh, build_rigged_mesh
-from common.body.skeleton_pose import SkeletonPose
+from common.body.skeleton_pose import SkeletonPose, forward_kinematics
+from common.body.skinning import link_motion
+from common.body.vertex_blend import VertexBlend
+from common.geometry.triangle_mesh import TriangleMesh
 from common.runtime.clock import ManualClock
 from common.runtime.stage_timer import StageTimer
 from common.wire.skeleton_packet import SkeletonPacket
 from receiver.config import RepositorySettings
-from receiver.live_path import FADE_NS, PERIOD_NS, STALE_NS
+from receiver.live_path import FADE_NS, PERIOD_NS, STALE_NS, LivePath
 from receiver.pipeline import AnimationPath, MapPath, ReceivedPose, Shown, SkeletonToShow
+from receiver.residual_decoder import ResidualMaps
 from receiver.viewer.offscreen_viewer import OffscreenViewer
 from receiver.viewer.viewer import ViewMode
 from tests.capsule_person import SHIRT, SKELETON, pose_at
@@ -34,6 +39,7 @@ class Receiver:
         clock = ManualClock()
         self.animation = AnimationPath(RepositorySettings(), StageTimer(clock), clock)
         self.maps = MapPath(0, StageTimer(clock))
+        self.newest: ResidualMaps | None = None
         self.sequence = 0
 
     @property
@@ -43,6 +49,7 @@ class Receiver:
     def packet(self, data: bytes) -> None:
         new = self.maps.take(data, lambda _: {REVISION: BODY}, False)
         assert new
+        self.newest = new[-1].maps
         self.animation.live.note_maps(new[-1].maps)
 
     def skeleton(self, pose: SkeletonPose, *arrived: ReceivedPose, epoch: int = EPOCH) -> Shown:
@@ -129,12 +136,52 @@ def test_all_that_are_blended_follow() -> None:
     assert both > 0.95 * alone > 0
 
 
+def test_an_id_that_stands_for_another_mesh_is_worked_out_anew(shirt: ChangingShirt) -> None:
+    """As when a whole pose follows its preview: what is known of the one has other vertices."""
+    live = LivePath(StageTimer(ManualClock()))
+    here = Receiver()
+    shown_for(here, shirt, FRAME_NS)
+    maps = here.newest
+    assert maps is not None
+    live.note_maps(maps)
+    T_world_link = forward_kinematics(SKELETON, pose_at(0.0))
+    whole = mesh_at(0.6)
+    fewer = whole.mesh.faces[: len(whole.mesh.faces) // 2]
+    kept = fewer.max() + 1
+    preview = replace(
+        whole,
+        mesh=TriangleMesh(whole.mesh.vertices[:kept], fewer, whole.mesh.uv[:kept], whole.mesh.texture),
+        vertex_link=whole.vertex_link[:kept],
+        blend=VertexBlend(whole.blend.other[:kept], whole.blend.share[:kept], whole.blend.joint[:kept]),
+    )
+    found = []
+    for mesh in (preview, whole):
+        now_ns = maps.header.capture_ns + len(found)
+        surfaces, _ = live.surfaces([(mesh, link_motion(mesh, T_world_link))], T_world_link, EPOCH, now_ns + FADE_NS)
+        found += surfaces
+    assert len(set(found)) == 2
+
+
+def test_a_mesh_that_is_soon_back_is_not_worked_out_anew(shirt: ChangingShirt) -> None:
+    here = Receiver()
+    here.skeleton(pose_at(0.0), ReceivedPose(EPOCH, shirt.mesh), ReceivedPose(EPOCH, mesh_at(0.6)))
+    shown_for(here, shirt, SECOND_NS)
+    live, T_world_link = here.animation.live, forward_kinematics(SKELETON, pose_at(1.0))
+    moved = [(mesh, link_motion(mesh, T_world_link)) for mesh in (shirt.mesh, mesh_at(0.6))]
+    both, _ = live.surfaces(moved, T_world_link, EPOCH, here.now_ns)
+    one, _ = live.surfaces(moved[:1], T_world_link, EPOCH, here.now_ns)
+    again, _ = live.surfaces(moved, T_world_link, EPOCH, here.now_ns)
+    assert (len(both), len(one)) == (2, 1)
+    assert again == both
+
+
 def test_in_a_frame_one_mesh_at_most_is_worked_out_anew(shirt: ChangingShirt) -> None:
     here = Receiver()
     here.skeleton(pose_at(0.0), ReceivedPose(EPOCH, shirt.mesh), ReceivedPose(EPOCH, mesh_at(0.6)))
     frames = [shown.frame.surfaces for shown in shown_for(here, shirt, SECOND_NS)]
     new = [len(set(after) - set(before)) for before, after in pairwise(frames)]
     assert max(new) == 1
+    assert max(map(len, frames)) == 2
     assert sum(new) > SECOND_NS / PERIOD_NS
 
 

@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from common.body.live_surface import LiveSurface
+from common.body.map_layout import map_layout
+from common.body.skeleton_pose import forward_kinematics
 from common.geometry.camera_model import Camera
 from receiver.viewer.offscreen_viewer import OffscreenViewer
 from receiver.viewer.viewer import ConnectionState, NullViewer, Viewer, ViewerStatus
-from tests.capsule_person import SHIRT, capsule_person, link_points, shown_frame
+from tests.capsule_person import SHIRT, SKELETON, capsule_person, link_points, pose_at, shown_frame
 
 # In front of the person at 3 m, looking along -Z.
 FRONT = Camera("front", 160, 200, 220.0, 220.0, 79.5, 99.5, np.array(
@@ -97,3 +102,25 @@ def test_every_viewer_takes_the_same_calls(viewer: Viewer) -> None:
     viewer.show(shown_frame(capsule_person(1), 0.0))
     viewer.set_status(ViewerStatus(ConnectionState.RECEIVING))
     viewer.remove_pose(1)
+
+
+def test_a_withheld_frame_is_the_picture_before_it_once_more() -> None:
+    """Though its links are the newest skeleton's, its mesh follows maps by those it was shown with."""
+    person = capsule_person(7)
+    layout = map_layout(SKELETON, 1000, 25.0)
+    offsets = np.full((layout.height, layout.width, 4), 128, np.uint8)
+    offsets[::2, :, 0] = 228  # rings about every link
+    viewer = OffscreenViewer(mode="live")
+    viewer.add_pose(person)
+    links = forward_kinematics(SKELETON, pose_at(0.5))[:, :3]
+    frame = dataclasses.replace(
+        shown_frame(person, 0.5), links=links, surfaces=(LiveSurface(7, layout, offsets),), live=1.0
+    )
+    viewer.show(frame)
+    before = viewer.render([FRONT])[0][0]
+    elsewhere = forward_kinematics(SKELETON, pose_at(1.7))[:, :3]
+    viewer.show(dataclasses.replace(frame, sequence=1, links=elsewhere))
+    assert (viewer.render([FRONT])[0][0] != before).any()
+    viewer.show(frame)
+    viewer.show(dataclasses.replace(frame, sequence=2, withheld=True, links=elsewhere))
+    np.testing.assert_array_equal(viewer.render([FRONT])[0][0], before)

@@ -23,7 +23,7 @@ from common.body.map_layout import map_layout
 from common.body.rigged_mesh import RiggedMesh
 from receiver.viewer import page_messages, web_viewer
 from receiver.viewer.page_messages import FRAME, LIVE, POINTS, POSE, REMOVE
-from receiver.viewer.viewer import ConnectionState, ViewerStatus
+from receiver.viewer.viewer import ConnectionState, MovedPose, ViewerStatus
 from receiver.viewer.web_viewer import MESSAGES_UNDER_WAY, WebViewer
 from tests.capsule_person import SKELETON, capsule_person, link_points, shown_frame
 
@@ -223,12 +223,43 @@ async def test_what_maps_show_goes_once_to_pages_that_show_it_before_its_frame()
         await live.socket.send_str("live")
         await until(lambda: served.viewer.wants_live)
         served.viewer.show(frame)
-        assert await live.binaries(2) == [(LIVE, 1), (FRAME, 5)]
+        assert await live.binaries(1) == [(FRAME, 5)]  # it does not have the pose
+        served.viewer.add_pose(PERSON)
+        assert await live.binaries(2) == [(POSE, 1), (LIVE, 1)]
         served.viewer.show(dataclasses.replace(frame, sequence=6))
         assert await live.binaries(1) == [(FRAME, 6)]
-        assert (FRAME, 6) in await of_mesh.binaries(2)
+        assert await of_mesh.binaries(3) == [(FRAME, 5), (POSE, 1), (FRAME, 6)]
         await live.socket.send_str("mesh")
         await until(lambda: not served.viewer.wants_live)
+
+
+@pytest.mark.parametrize("alone", [False, True])
+async def test_of_several_poses_what_maps_show_comes_one_a_round_and_goes_with_the_pose(alone: bool) -> None:
+    layout = map_layout(SKELETON, 1000, 25.0)
+    offsets = np.full((layout.height, layout.width, 4), 128, np.uint8)
+    frame = shown_frame(PERSON, 0.0, 5)
+    assert frame.motion is not None
+    surfaces = tuple(LiveSurface(pose_id, layout, offsets) for pose_id in (1, 2))
+    frame = dataclasses.replace(frame, others=(MovedPose(2, frame.motion),), surfaces=surfaces, live=1.0)
+    async with serve() as served, served.page() as page:
+        await page.socket.send_str("live")
+        if alone:
+            await page.socket.send_str("alone")
+        await until(lambda: served.viewer.wants_live)
+        for mesh in (PERSON, capsule_person(2)):
+            served.viewer.add_pose(mesh)
+            assert await page.binaries(1) == [(POSE, mesh.pose_id)]
+        served.viewer.show(frame)
+        seen = [(LIVE, 1), (FRAME, 5)] if alone else [(LIVE, 1), (FRAME, 5), (LIVE, 2)]
+        assert await page.binaries(len(seen)) == seen
+        newer = (surfaces[0], LiveSurface(2, layout, offsets))
+        served.viewer.show(dataclasses.replace(frame, sequence=6, surfaces=newer))
+        seen = [(FRAME, 6)] if alone else [(LIVE, 2), (FRAME, 6)]
+        assert await page.binaries(len(seen)) == seen
+        served.viewer.remove_pose(1)
+        assert await page.binaries(1) == [(REMOVE, 1)]
+        served.viewer.add_pose(PERSON)
+        assert await page.binaries(2) == [(POSE, 1), (LIVE, 1)]
 
 
 async def test_pose_id_used_again_is_uploaded_again() -> None:

@@ -94,7 +94,7 @@ def _placed(pixels, ideal, depths_mm, to_world, height, width):  # type: ignore[
 @njit(nogil=True, cache=True, error_model="numpy")
 def _smooth(depth_mm, radius, range_mm):  # type: ignore[no-untyped-def]
     """Band by band, of its columns in which there is anybody, and pair by pair: the innermost loop, over a band as one
-    row, is one the compiler can vectorise. A margin of background keeps what is added beyond an edge from counting."""
+    row, is one the compiler can vectorise. What it adds up in the margins at both sides is of no row and cut off."""
     h, w = depth_mm.shape
     margin, out = radius + 1, np.zeros((h, w), np.float32)
     room = np.empty((_BAND_ROWS + 2 * margin) * (w + 2 * radius), np.float32)

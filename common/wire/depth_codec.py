@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 
 from common.wire.arithmetic_coder import close_coder, code_bit, open_coder, open_contexts
 from common.wire.header import WireError, checked_int
-
-DEPTH_ERROR_MAX_MM = 16
+from common.wire.view_quality import DEPTH_ERROR_MAX_MM
 
 _PATTERNS = 1024  # of ten neighbours
 _ALL = _PATTERNS - 1
@@ -24,7 +23,7 @@ _UNARY = 10  # up to here a magnitude is counted bit by bit
 _LEVELS = 8  # of how far the neighbours were off
 _PER_LEVEL = _UNARY + 2  # none, each magnitude, sign
 _LENGTHS = 18  # bits of a large magnitude
-_PIXEL_MAX_BYTES = 80
+_PIXEL_MAX_BYTES = 80  # 47 bits at most are coded, into 12 bits each at most: 71
 
 # What a reading follows from, of 16: left, above, left above, right above; by least squares over fused views of the
 # virtual rig. Where readings are coarse, their rounding is noise that a mean takes away.
@@ -118,6 +117,8 @@ def _code(depth_mm, error_mm, stream, decoding):  # type: ignore[no-untyped-def]
         here, above, second = rows[v % 3], rows[(v - 1) % 3], rows[(v - 2) % 3]
         off, off_above = offs[v % 2], offs[(v - 1) % 2]
         here[:], off[:] = 0, 0
+        if decoding and coder[3] > len(stream):
+            return coder[3]  # it ended long ago
         u = one_by_one_to = person_to = 2
         while u < width + 2:
             value = np.int64(depth_mm[v, u - 2])

@@ -96,6 +96,8 @@ def _code(places, full, before, known, stream, decoding):  # type: ignore[no-unt
             top, left, rows, columns = places[link]
             _put(last, before if n == 0 else full[n - 1], top, left, rows, columns)
             for v in range(2, rows + 2):
+                if decoding and coder[3] > len(stream):
+                    return coder[3]  # it ended long ago
                 here[v, : columns + 4] = 0
                 for u in range(2, columns + 2):
                     context = _context(here, last, known or n > 0, v, u)

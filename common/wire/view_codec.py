@@ -15,9 +15,9 @@ import numpy as np
 from common.body.view import View
 from common.geometry.camera_model import Camera
 from common.wire.colour_codec import decode_colour, encode_colour
-from common.wire.depth_codec import DEPTH_ERROR_MAX_MM, decode_depth, encode_depth
+from common.wire.depth_codec import decode_depth, encode_depth
 from common.wire.header import VIEW_VERSION, WireError, check_start, checked_float, checked_int
-from common.wire.view_quality import FINE, ViewQuality
+from common.wire.view_quality import DEPTH_ERROR_MAX_MM, FINE, ViewQuality
 
 VIEW_MAX_BYTES = 1 << 22
 VIEW_MAX_PIXELS = 1 << 22

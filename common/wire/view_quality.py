@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 ColourFormat = Literal["jpeg", "webp"]
+DEPTH_ERROR_MAX_MM = 16
 
 
 @dataclass(frozen=True, slots=True)

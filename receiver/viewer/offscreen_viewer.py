@@ -72,6 +72,8 @@ class OffscreenViewer:
         self._newest = frame
         if frame.pose_id is None:
             self._on_screen = None
+        elif frame.withheld and self._on_screen is not None and self._on_screen[0].pose_id == frame.pose_id:
+            self.frames_shown += 1  # the same picture again: its meshes do not follow where the links are now
         elif frame.pose_id in self._poses:
             others = [(self._poses[other.pose_id], other) for other in frame.others if other.pose_id in self._poses]
             self._on_screen = (frame, self._poses[frame.pose_id], others)

@@ -9,19 +9,19 @@ four bytes, so that the page reads typed arrays in place (``web/src/messages.js`
   in 1/255), ``joints f32[L, 3]`` at capture, ``index u16[F, 3]`` (u32 if V > 65,536), padding, and the texture as JPEG.
 - FRAME, every skeleton: ``pose_id u32, sequence u32, sigma f32, fit_confidence f32, age_ms f32, motion f32[L, 3, 4],
   joints f32[L, 3], links f32[L, 3, 4], confidence u8[L]``, padding, and for each pose that it is blended with
-  ``pose_id u32, motion f32[L, 3, 4]``: 4,748 bytes with two others, 1.14 Mbit/s at 30 Hz. The first of its two zero
-  bytes is 1 when it is withheld: the last good picture once more; the second, how much of the newest LIVE of the same
-  pose it shows, in 1/255. ``links`` (T_world_link) move points, and tell where in LIVE a vertex is.
+  ``pose_id u32, motion f32[L, 3, 4]``: 6,964 bytes with four others, 1.67 Mbit/s at 30 Hz. The first of its two zero
+  bytes is 1 when it is withheld: the last good picture once more; the second, how much of the newest LIVE of its
+  poses it shows, in 1/255. ``links`` (T_world_link) move points, and tell where in LIVE a vertex is.
 - REMOVE: ``pose_id u32``.
 - POINTS, every residual packet, to pages that show points: ``points N u32, box_min f32[3], box_size f32[3], radius f32,
   position u16[N, 3]`` (0..65535 over the box, in the frame of the point's link), padding, ``colour and link u8[N, 4]``:
   10 bytes a point. With N = 0 there are none any more.
-- LIVE, when there is a newer one, before the FRAME that shows it, to pages that show it: ``pose_id u32, width W u32,
-  height H u32, step f32, cylinders f32[L, 3, 3], sizes f32[L, 2], places i32[L, 4]`` (as in ``MapLayout``), ``offsets
-  u8[H, W, 4]`` about 128: red, green, blue, and outwards in ``step`` [m]. 60 kB, ten times a second.
+- LIVE, of one of a FRAME's poses, before it, when there is a newer one, to pages that show it: ``pose_id u32, width W
+  u32, height H u32, step f32, cylinders f32[L, 3, 3], sizes f32[L, 2], places i32[L, 4]`` (as in ``MapLayout``),
+  ``offsets u8[H, W, 4]`` about 128: red, green, blue, and outwards in ``step`` [m]. 60 kB, at most with every FRAME.
 
 The page answers each binary message with one ``u32``: how many it has taken in so far. What it shows, where that is not
-HELLO's ``mode``, it says as the text "mesh", "live" or "points".
+HELLO's ``mode``, it says as the text "mesh", "live" or "points", and "alone" if it draws no pose but the best.
 """
 
 from __future__ import annotations
@@ -48,6 +48,7 @@ if TYPE_CHECKING:
 VERSION = 7
 POSE, FRAME, REMOVE, POINTS, LIVE = 1, 2, 3, 4, 5
 NO_POSE = 0xFFFFFFFF
+ALONE = "alone"
 QUANTIZATION_STEPS = 65535
 SHORT_INDEX_VERTICES = 65536
 JPEG_QUALITY = 90  # above the received views' own: a second coding should add little

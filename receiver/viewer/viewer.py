@@ -54,7 +54,8 @@ class ShownFrame:
     ``region_sigma`` (R,) float32: its σ_r by region (``REGION_NAMES``; nan: not seen), None without a pose.
     ``fit_confidence``: 0..1. ``confidence`` (L,) float32: 0 = that link was not seen.
     ``age_ms``: time from capture to this call [ms], nan while the clock offset to the sender is unknown.
-    ``withheld``: the newest skeleton would distort every mesh too much (DISPOSE §8); this is the last good frame again.
+    ``withheld``: the newest skeleton would distort every mesh too much (DISPOSE §8); this is the last good frame again,
+    but for ``links``: points are where the newest skeleton is.
 
     Raises:
         ValueError: wrong shapes, or a motion without a pose.

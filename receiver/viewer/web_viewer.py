@@ -20,6 +20,7 @@ from aiohttp import WSCloseCode, WSMsgType, web
 
 from common.body.skinning import Skinning
 from receiver.viewer.page_messages import (
+    ALONE,
     decode_acknowledgement,
     decode_mode,
     encode_frame,
@@ -202,10 +203,12 @@ class WebViewer:
             pass  # the reading side sees the same end and tidies up
 
     async def _send_difference(self, page: _Page) -> bool:
-        """One round: what left, the newest figures, at most one mesh, the newest frame. False if nothing was due."""
+        """One round: what left, the newest figures, at most one mesh and one LIVE, the newest frame. False if nothing
+        was due."""
         sent_before = page.sent
         for pose_id in page.poses - self._poses.keys():
             page.poses.discard(pose_id)
+            page.surfaces.pop(pose_id, None)
             await page.send(encode_remove(pose_id))
         if page.status is not self._status:
             page.status = self._status
@@ -219,17 +222,28 @@ class WebViewer:
             page.points = self._points
             self._points_message = self._points_message or encode_points(self._points)
             await page.send(self._points_message)
-        if page.mode == "live":
-            lacking = [surface for surface in self._surfaces if surface not in page.surfaces]
-            page.surfaces = set(self._surfaces)
-            for surface in lacking:
-                if surface not in self._surface_messages:
-                    self._surface_messages[surface] = encode_live(surface)
-                await page.send(self._surface_messages[surface])
-        if self._frame is not None and page.frame is not self._frame:
-            page.frame = self._frame
-            await page.send(page.frame)
+        frame, surface = self._frame, self._next_surface(page)
+        if surface is not None:
+            page.surfaces[surface.pose_id] = surface
+            await page.send(self._surface_message(surface))
+        if frame is not None and page.frame is not frame:
+            page.frame = frame
+            await page.send(frame)
         return page.sent > sent_before
+
+    def _next_surface(self, page: _Page) -> LiveSurface | None:
+        """What the page lacks of what maps show beyond the poses it draws and has, the best pose first."""
+        if page.mode != "live":
+            return None
+        for surface in self._surfaces[:1] if page.alone else self._surfaces:
+            if surface.pose_id in page.poses and page.surfaces.get(surface.pose_id) is not surface:
+                return surface
+        return None
+
+    def _surface_message(self, surface: LiveSurface) -> bytes:
+        if surface not in self._surface_messages:
+            self._surface_messages[surface] = encode_live(surface)
+        return self._surface_messages[surface]
 
     def _next_missing(self, page: _Page) -> int | None:
         """The pose to upload next: the one on screen first, then the newest."""
@@ -268,7 +282,8 @@ class _Page:
         self.socket = socket
         self.mode = mode
         self.points: LinkPoints | None = None
-        self.surfaces: set[LiveSurface] = set()
+        self.alone = False  # it draws the best pose alone
+        self.surfaces: dict[int, LiveSurface] = {}  # the newest it has, by pose
         self.wake = asyncio.Event()
         self.poses: set[int] = set()
         self.frame: bytes | None = None
@@ -289,7 +304,10 @@ class _Page:
         async for message in self.socket:
             try:
                 if message.type is WSMsgType.TEXT:
-                    self.mode = decode_mode(message.data)
+                    if message.data == ALONE:
+                        self.alone = True
+                    else:
+                        self.mode = decode_mode(message.data)
                     self.wake.set()
                     continue
                 if message.type is not WSMsgType.BINARY:

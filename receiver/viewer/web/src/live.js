@@ -69,8 +69,12 @@ export class LiveSurface {
 
   load(message) {
     const { offsets, size, place, outwardStep } = this.uniforms;
-    this.dispose();
-    offsets.value = new THREE.DataTexture(message.offsets, message.width, message.height);
+    const image = offsets.value?.image;
+    if (image?.width === message.width && image.height === message.height) image.data = message.offsets;
+    else {
+      this.dispose();
+      offsets.value = new THREE.DataTexture(message.offsets, message.width, message.height);
+    }
     offsets.value.needsUpdate = true;
     size.value.set(message.sizes);
     place.value.set(message.places);

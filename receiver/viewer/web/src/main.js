@@ -31,6 +31,7 @@ const receiver = connect({
     points.clear();
     setMode(chosen ?? first);
     if (mode !== first) receiver.send(mode);
+    if (!person.blends) receiver.send("alone");
     person.skinning = skinning;
     skeleton.setLinks(link_parents);
   },

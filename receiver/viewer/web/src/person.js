@@ -128,7 +128,8 @@ export class Person {
     uniforms.motion.value.set(motion);
     uniforms.turn.value.forEach((turn, link) => turn.setFromRotationMatrix(matrixOf(motion, link)));
     uniforms.share.value = share;
-    mesh.userData.live.show(this.follows ? (this.surfaces.get(poseId) ?? null) : null, this.frame);
+    const surface = this.follows ? (this.surfaces.get(poseId) ?? null) : null;
+    if (!surface || !this.frame.withheld) mesh.userData.live.show(surface, this.frame); // else as it was: links have moved
     mesh.visible = true;
     return mesh;
   }
