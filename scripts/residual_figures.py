@@ -20,10 +20,12 @@ import numpy as np
 from common.geometry.point_cloud import PointCloud
 from receiver.residual_decoder import ResidualDecoder, cloud
 from scripts.bench_residuals import CAPTURED_S
-from scripts.fidelity_capture import FRAME_RATE_HZ, capture, show_progress
+from scripts.fidelity import finer, smooth
+from scripts.fidelity_capture import FRAME_RATE_HZ, Capture, capture, show_progress
+from scripts.fidelity_live import DisposeLive
 from scripts.fidelity_strip import QUALITY, labelled_row
 from scripts.line_chart import line_chart
-from scripts.residual_quality import fixed_cameras, pictures
+from scripts.residual_quality import SAMPLES, fixed_cameras, pictures
 from scripts.residual_rivals import filmed
 from scripts.residual_sequences import PosedSequence, captured_sequence
 from scripts.run_bench import Row
@@ -34,6 +36,7 @@ RATE_UP_TO_BYTES = 45_000
 STRIP_S = (2.0, 4.0, 6.0, 8.0, 10.0)
 STRIP_LEVELS = (0.0, 25.0, 100.0)
 FRAMES_EVERY = 5
+LIVE_BPS = 1e6
 
 
 def main() -> None:
@@ -61,7 +64,7 @@ def main() -> None:
     (options.out / "compression_frames.svg").write_text(
         frames_chart(case, sequence, {level: clouds for level, (clouds, _) in shown.items()})
     )
-    strip = strip_of(sequence, shown)
+    strip = strip_of(sequence, shown, recorded)
     cv2.imwrite(str(options.out / "compression_strip.jpg"), strip[:, :, ::-1], [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
 
 
@@ -118,8 +121,10 @@ def _whole_tens(values: Iterable[float]) -> float:
     return float(10 * np.floor(min(values) / 10))
 
 
-def strip_of(sequence: PosedSequence, shown: dict[float, tuple[list[PointCloud], float]]) -> np.ndarray:
-    """Truth, levels, and H.265 at the rate of 25 %, at some instants."""
+def strip_of(
+    sequence: PosedSequence, shown: dict[float, tuple[list[PointCloud], float]], recorded: Capture
+) -> np.ndarray:
+    """Input, levels, H.265 at the rate of 25 %, and meshes with a live surface, at some instants."""
     ks = [round(s * FRAME_RATE_HZ) for s in STRIP_S if round(s * FRAME_RATE_HZ) < sequence.length]
     rows = [labelled_row("input", [_seen(sequence, k, sequence.cloud(k)) for k in ks], [""] * len(ks))]
     for level, (clouds, size) in sorted(shown.items()):
@@ -129,7 +134,20 @@ def strip_of(sequence: PosedSequence, shown: dict[float, tuple[list[PointCloud],
     coded = [h265(sequence, k) for k in ks]
     label = f"H.265, {coded[0].size_bytes / 1000:.1f} kB"
     rows.append(_row(sequence, label, ks, [frame.decoded() for frame in coded]))
+    rows.append(labelled_row(f"live, {LIVE_BPS / 1e6:g} Mbit/s", _live(sequence, recorded, ks), [""] * len(ks)))
     return np.vstack(rows)
+
+
+def _live(sequence: PosedSequence, recorded: Capture, ks: list[int]) -> list[np.ndarray]:
+    """What a receiver with a live surface shows of these frames, from the front."""
+    method, found = DisposeLive(LIVE_BPS, own=True), []
+    for k in range(max(ks) + 1):
+        method.frame(k, recorded.frame(k))
+        if k in ks:
+            assert method.screen is not None
+            camera = finer(fixed_cameras(sequence.cloud(k), sequence.height_m)[0], SAMPLES)
+            found.append(smooth(method.screen.picture([camera])[0][0], SAMPLES))
+    return found
 
 
 def _row(sequence: PosedSequence, label: str, ks: list[int], clouds: list[PointCloud]) -> np.ndarray:
