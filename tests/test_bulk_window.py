@@ -265,6 +265,34 @@ def test_reports_about_another_run_acknowledge_nothing() -> None:
     assert window.in_flight_bytes == 1200
 
 
+def test_the_time_before_a_receiver_heard_of_the_run_is_no_part_of_the_rate() -> None:
+    """Its clock shows hours; the first chunks were on their way before its first skeleton was there."""
+    window, hours_ns = BulkWindow(EPOCH), 8 * 3600 * S
+    strange = replace(report(0), sender_epoch=None, clock_ns=hours_ns)
+    window.on_report(strange, 0)
+    for _ in range(10):
+        window.on_sent(1500, 10 * MS)
+    window.on_report(replace(strange, number=2, clock_ns=hours_ns + 50 * MS), 50 * MS)
+    heard = replace(report(100 * MS, 3), clock_ns=hours_ns + 100 * MS, next_chunk=10)
+    assert len(window.on_report(heard, 100 * MS).arrived) == 10
+    assert window.rate_bytes_s > 15_000 / 0.2
+
+
+def test_however_slow_a_path_seems_the_floor_is_in_the_budget() -> None:
+    """Who is told of no budget sends nothing, and the rate would never be known better."""
+    window = BulkWindow(EPOCH)
+    window.on_report(report(0), 0)
+    for number in range(2, 10):
+        for _ in range(9):
+            window.on_sent(1200, 10 * number * S)
+        answer = replace(
+            report(10 * number * S, number), clock_ns=10 * (number + 1) * S - 1, next_chunk=9 * (number - 1)
+        )
+        window.on_report(answer, 10 * (number + 1) * S - 1)
+    assert window.rate_bytes_s < 2000
+    assert window.budget_bytes(S) == int(0.9 * WindowSettings().floor_bps / 8)
+
+
 def test_old_and_too_frequent_reports_are_counted_and_ignored() -> None:
     run = BulkSimulation(TEN_MEGABIT).run(5)
     window, before, now_ns = run.window, run.window.window_bytes, run.loop.now_ns() + 50 * MS

@@ -137,7 +137,8 @@ class BulkWindow:
 
     def budget_bytes(self, period_ns: int) -> int:
         """How many more bytes the path takes within ``period_ns``."""
-        return max(0, int(0.9 * self.rate_bytes_s * period_ns * NS) - self._in_flight_bytes)
+        rate_bytes_s = max(self.rate_bytes_s, self._settings.floor_bps / 8)  # however slow it seems, that much may go
+        return max(0, int(0.9 * rate_bytes_s * period_ns * NS) - self._in_flight_bytes)
 
     def time_to_deliver_s(self, size: int) -> float:
         """Roughly how long ``size`` bytes take to arrive."""
@@ -184,6 +185,7 @@ class BulkWindow:
             self._rate_from_ns = report.clock_ns
             return self._on_restart()
         if report.sender_epoch != self._epoch:
+            self._rate_from_ns = report.clock_ns
             return Outcome()  # it has not heard of this run yet; but it is there
         outstanding = self._in_flight_bytes
         outcome, acked, acked_ns = self._resolve(report)
