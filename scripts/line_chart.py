@@ -10,16 +10,8 @@ import numpy as np
 WIDTH, HEIGHT = 760, 340
 LEFT, RIGHT, TOP, BOTTOM = 64, 16, 56, 48  # room around the axes for their texts
 LETTER, GAP = 7.0, 18  # width of a letter, about; between names
-COLOURS = (
-    "#0072b2",
-    "#d55e00",
-    "#009e73",
-    "#cc79a7",
-    "#e69f00",
-    "#56b4e9",
-    "#000",
-    "#888",
-)  # told apart by everyone (Okabe & Ito)
+# Told apart by everyone (Okabe & Ito).
+COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000", "#888")
 Line = tuple[Sequence[float], Sequence[float]]
 
 

@@ -45,7 +45,7 @@ from receiver.viewer.viewer import ShownFrame, ViewerStatus, ViewMode
 if TYPE_CHECKING:
     from common.body.rigged_mesh import RiggedMesh
 
-VERSION = 7
+VERSION = 8
 POSE, FRAME, REMOVE, POINTS, LIVE = 1, 2, 3, 4, 5
 NO_POSE = 0xFFFFFFFF
 ALONE = "alone"

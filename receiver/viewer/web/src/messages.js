@@ -1,6 +1,6 @@
 // The page's end of receiver/viewer/page_messages.py: typed arrays read in place, little-endian.
 
-export const VERSION = 7;
+export const VERSION = 8;
 const KINDS = { 1: decodePose, 2: decodeFrame, 3: decodeRemove, 4: decodePoints, 5: decodeLive };
 const NO_POSE = 0xffffffff;
 export const LINKS = 23;
