@@ -46,43 +46,33 @@ def decode_masks(
 @njit(nogil=True, cache=True)
 def _room(places):  # type: ignore[no-untyped-def]
     """An empty grid large enough for every link's, and two cells around it."""
-    return np.zeros((places[:, 2].max() + 4, places[:, 3].max() + 4), np.int64)
+    return np.zeros((places[:, 2].max() + 4, places[:, 3].max() + 4), np.uint8)
 
 
 @njit(nogil=True, cache=True)
-def _round_off(grid, row, columns):  # type: ignore[no-untyped-def]
-    """A row is complete: it goes on at its other side."""
+def _round_off(row, columns):  # type: ignore[no-untyped-def]
+    """A row of a grid is complete: it goes on at its other side."""
     for n in range(2):
-        grid[row, n] = grid[row, columns + n]
-        grid[row, columns + 2 + n] = grid[row, 2 + n]
+        row[n] = row[columns + n]
+        row[columns + 2 + n] = row[2 + n]
 
 
 @njit(nogil=True, cache=True)
-def _put(grid, full, top, left, rows, columns):  # type: ignore[no-untyped-def]
+def _put(grid, full, place):  # type: ignore[no-untyped-def]
     """A link's cells in ``full`` (H, W) into ``grid``, with what is around them; beyond its ends a link has none."""
-    for row in range(2, rows + 2):
-        for column in range(2, columns + 2):
-            grid[row, column] = full[top + row - 2, left + column - 2]
-        _round_off(grid, row, columns)
+    top, left, rows, columns = place
+    for row in range(rows):
+        out = grid[row + 2]
+        for column in range(columns):
+            out[column + 2] = full[top + row, left + column]
+        _round_off(out, columns)
     grid[rows + 2, : columns + 4] = 0
 
 
-@njit(nogil=True, cache=True)
-def _context(here, last, known, v, u):  # type: ignore[no-untyped-def]
-    """The number of the pattern around a cell: of cells that come before it in ``here``, and of the frame before."""
-    pattern = (
-        here[v, u - 1]
-        | here[v, u - 2] << 1
-        | here[v - 1, u] << 2
-        | here[v - 1, u - 1] << 3
-        | here[v - 1, u + 1] << 4
-        | here[v - 2, u] << 5
-    )
-    if known:
-        return pattern | last[v, u] << 6 | last[v, u + 1] << 7 | last[v + 1, u] << 8 | 1024
-    return (
-        pattern | here[v - 1, u + 2] << 6 | here[v - 1, u - 2] << 7 | here[v - 2, u - 1] << 8 | here[v - 2, u + 1] << 9
-    )
+@njit(nogil=True, cache=True, inline="always")
+def _shifted(pattern, cell, cells):  # type: ignore[no-untyped-def]
+    """The last so many ``cells`` of a row, one further."""
+    return (pattern << 1 | np.int64(cell)) & ((1 << cells) - 1)
 
 
 @njit(nogil=True, cache=True)
@@ -92,17 +82,54 @@ def _code(places, full, before, known, stream, decoding):  # type: ignore[no-unt
     coder, contexts = open_coder(stream, decoding), open_contexts(_CONTEXTS)
     here, last = _room(places), _room(places)
     for n in range(len(full)):
+        follows = known or n > 0
         for link in range(len(places)):
             top, left, rows, columns = places[link]
-            _put(last, before if n == 0 else full[n - 1], top, left, rows, columns)
-            for v in range(2, rows + 2):
+            if follows:
+                _put(last, before if n == 0 else full[n - 1], places[link])
+            for v in range(rows):
                 if decoding and coder[3] > len(stream):
                     return coder[3]  # it ended long ago
-                here[v, : columns + 4] = 0
-                for u in range(2, columns + 2):
-                    context = _context(here, last, known or n > 0, v, u)
-                    cell = np.int64(full[n, top + v - 2, left + u - 2])
-                    cell, coder = code_bit(coder, stream, decoding, contexts, context, cell)
-                    here[v, u] = full[n, top + v - 2, left + u - 2] = cell
-                _round_off(here, v, columns)
+                cells, around = full[n, top + v, left : left + columns], here[v : v + 3]
+                if follows:
+                    then = last[v + 2 : v + 4]
+                    coder = _code_row_after(coder, stream, decoding, contexts, cells, around, then)
+                else:
+                    coder = _code_row(coder, stream, decoding, contexts, cells, around)
+                _round_off(here[v + 2], columns)
     return close_coder(coder, stream, decoding)
+
+
+@njit(nogil=True, cache=True, inline="always")
+def _code_row(coder, stream, decoding, contexts, cells, here):  # type: ignore[no-untyped-def]
+    """A row's ``cells`` (W,), by those around them ``here``: the two rows above and its own, which is set, two cells
+    further left than ``cells``. Patterns are shifted along: to look every cell up anew takes four times as long."""
+    higher, above, own = here[0], here[1], here[2]
+    left, wide, far = np.int64(0), np.int64(0), np.int64(0)  # 2 cells to the left, 5 above, 3 above these
+    for u in range(4):
+        wide = _shifted(wide, above[u], 5)
+    for u in range(1, 3):
+        far = _shifted(far, higher[u], 3)
+    for u in range(len(cells)):
+        wide, far = _shifted(wide, above[u + 4], 5), _shifted(far, higher[u + 3], 3)
+        context = left | wide << 2 | far << 7
+        cell, coder = code_bit(coder, stream, decoding, contexts, context, np.int64(cells[u]))
+        cells[u] = own[u + 2] = cell
+        left = _shifted(left, cell, 2)
+    return coder
+
+
+@njit(nogil=True, cache=True, inline="always")
+def _code_row_after(coder, stream, decoding, contexts, cells, here, last):  # type: ignore[no-untyped-def]
+    """The same where ``last`` is known: this row and the one below it, of the frame before."""
+    higher, above, own = here[0], here[1], here[2]
+    same, below = last[0], last[1]
+    left, near = np.int64(0), np.int64(above[1]) << 1 | np.int64(above[2])  # 2 cells to the left, 3 above
+    then = np.int64(same[2])  # this cell and the next
+    for u in range(len(cells)):
+        near, then = _shifted(near, above[u + 3], 3), _shifted(then, same[u + 3], 2)
+        context = left | near << 2 | then << 5 | np.int64(higher[u + 2]) << 7 | np.int64(below[u + 2]) << 8 | 1024
+        cell, coder = code_bit(coder, stream, decoding, contexts, context, np.int64(cells[u]))
+        cells[u] = own[u + 2] = cell
+        left = _shifted(left, cell, 2)
+    return coder
