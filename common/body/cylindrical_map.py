@@ -170,55 +170,74 @@ def _gathered(cells, radii, colours, count):  # type: ignore[no-untyped-def]
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
-def _close(places, before, full, colour, radius):  # type: ignore[no-untyped-def]
+def _close(places, room, full, colour, radius):  # type: ignore[no-untyped-def]
     """Fill empty cells among at least five full neighbours, in place, as long as there are any but at most so often.
 
-    ``before``: room for a grid as it was, with what is around it: the other side left and right, nothing above and
+    ``room``: for a grid as it was before, with what is around it: the other side left and right, nothing above and
     below.
     """
+    in_column, in_block = np.empty(room.shape[1], np.uint8), np.empty(room.shape[1], np.uint8)
+    changed, changing = np.empty(len(room), np.bool_), np.empty(len(room), np.bool_)  # rows
     for link in range(len(places)):
         top, left, rows, columns = places[link]
+        before = room[: rows + 2, : columns + 2]
+        before[0], before[rows + 1] = 0, 0
+        changed[:] = True
         for _ in range(_CLOSING_PASSES):
-            before[0, : columns + 2] = before[rows + 1, : columns + 2] = 0
-            for row in range(rows):
-                for column in range(columns):
-                    before[row + 1, column + 1] = full[top + row, left + column]
-                before[row + 1, 0], before[row + 1, columns + 1] = before[row + 1, columns], before[row + 1, 1]
-            filled = False
             for row in range(1, rows + 1):
-                for column in range(1, columns + 1):
-                    count = before[row - 1, column] + before[row + 1, column]
-                    count += before[row, column - 1] + before[row, column + 1]
-                    if before[row, column] or count == 0:
-                        continue  # the four at the corners are too few: most of the void is done with here
-                    count += before[row - 1, column - 1] + before[row - 1, column + 1]
-                    count += before[row + 1, column - 1] + before[row + 1, column + 1]
-                    if count >= _CLOSING_NEIGHBOURS:
-                        _fill_by_mean(before, full, colour, radius, row, column, places[link])
-                        filled = True
-            if not filled:
+                if changed[row]:
+                    before[row, 1 : columns + 1] = full[top + row - 1, left : left + columns]
+                    before[row, 0], before[row, columns + 1] = before[row, columns], before[row, 1]
+            changing[:] = False
+            for row in range(1, rows + 1):
+                if not (changed[row - 1] or changed[row] or changed[row + 1]):
+                    continue
+                if _most_around(before[row - 1 : row + 2], in_column, in_block) < _CLOSING_NEIGHBOURS:
+                    continue  # most of the void, and of what is full
+                for column in range(columns):
+                    if in_block[column] >= _CLOSING_NEIGHBOURS:
+                        _fill_by_mean(before, full, colour, radius, row, column + 1, places[link])
+                        changing[row] = True
+            changed, changing = changing, changed
+            if not changed.any():
                 break
+
+
+@njit(nogil=True, cache=True)
+def _most_around(rows, in_column, in_block):  # type: ignore[no-untyped-def]
+    """How many of their 8 neighbours are full, for the cells of the middle one of three ``rows`` that are empty, to
+    ``in_block``, and the most of these."""
+    above, own, below = rows[0], rows[1], rows[2]
+    for n in range(len(own)):
+        in_column[n] = above[n] + own[n] + below[n]
+    most = np.uint8(0)
+    for n in range(len(own) - 2):
+        count = np.uint8((in_column[n] + in_column[n + 1] + in_column[n + 2]) * (1 - own[n + 1]))
+        in_block[n] = count
+        most = max(most, count)
+    return most
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
 def _fill_by_mean(before, full, colour, radius, row, column, place):  # type: ignore[no-untyped-def]
     """The cell at (row, column) of ``before`` becomes the mean of its neighbours that were full then."""
-    top, left, _, columns = place
+    top, left, rows, columns = place
     count = red = green = blue = steps = np.int64(0)
-    for y in range(row - 1, row + 2):
-        for x in range(column - 1, column + 2):
-            if before[y, x]:
-                v, u = top + y - 1, left + (x - 1) % columns
-                count += 1
-                steps += radius[v, u]
-                red += colour[v, u, 0]
-                green += colour[v, u, 1]
-                blue += colour[v, u, 2]
-    half, v, u = count // 2, top + row - 1, left + column - 1
+    for x in range(column - 1, column + 2):
+        u = left + (columns if x == 0 else 1 if x > columns else x) - 1
+        for y in range(row - 1, row + 2):
+            v, one = top + min(max(y, 1), rows) - 1, np.int64(before[y, x])  # no if: which are full is hard to guess
+            count += one
+            steps += one * radius[v, u]
+            red += one * colour[v, u, 0]
+            green += one * colour[v, u, 1]
+            blue += one * colour[v, u, 2]
+    half, number = count // 2, np.float32(count)  # of integers this small a float's quotient is right, and fast
+    v, u = top + row - 1, left + column - 1
     full[v, u] = True
-    radius[v, u] = (steps + half) // count
-    colour[v, u, 0], colour[v, u, 1] = (red + half) // count, (green + half) // count
-    colour[v, u, 2] = (blue + half) // count
+    radius[v, u] = int(np.float32(steps + half) / number)
+    colour[v, u, 0], colour[v, u, 1] = int(np.float32(red + half) / number), int(np.float32(green + half) / number)
+    colour[v, u, 2] = int(np.float32(blue + half) / number)
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
@@ -262,11 +281,14 @@ def _resample(places, full, colour, radius, finer, out_full, out_colour, out_rad
 @njit(nogil=True, cache=True, error_model="numpy")
 def _points_of(places, sizes, R, origins, full, colour, radius, positions, normals, colours, links):  # type: ignore[no-untyped-def]
     """Fill the arrays with the full cells' points, return how many there are."""
-    n = 0
+    n, quarter = 0, np.float32(np.pi / 2)
+    around = np.empty((places[:, 3].max(), 2), np.float32)  # cosine and sine of each column's angle
     for link in range(len(places)):
         top, left, rows, columns = places[link]
         length, cap = sizes[link, 0], sizes[link, 1]
-        quarter = np.float32(np.pi / 2)
+        for column in range(columns):
+            angle = ((np.float32(column) + np.float32(0.5)) / columns * 4 - 2) * quarter
+            around[column] = np.float32(np.cos(angle)), np.float32(np.sin(angle))
         for row in range(rows):
             height = (np.float32(row) + np.float32(0.5)) / rows * (length + 2 * cap * quarter) - cap * quarter
             along = min(max(height, np.float32(0)), length)
@@ -276,12 +298,14 @@ def _points_of(places, sizes, R, origins, full, colour, radius, positions, norma
             given = -1  # of so many columns the first full one
             for column in range(columns):
                 v, u = top + row, left + column
-                if not full[v, u] or column // every == given:
+                if not full[v, u]:
                     continue
-                given = column // every
-                angle = ((np.float32(column) + np.float32(0.5)) / columns * 4 - 2) * quarter
+                if every > 1:
+                    if column // every == given:
+                        continue
+                    given = column // every
                 distance = np.float32(radius[v, u]) * np.float32(RADIUS_STEP_M)
-                front, side = cosine * np.float32(np.cos(angle)), cosine * np.float32(np.sin(angle))
+                front, side = cosine * around[column, 0], cosine * around[column, 1]
                 for i in range(3):
                     outward = R[link, i, 0] * front + R[link, i, 1] * side + R[link, i, 2] * sine
                     normals[n, i] = outward

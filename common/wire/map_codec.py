@@ -97,9 +97,7 @@ def decode_maps(
         raise WireError("radius: a difference without a reference")
     radius = _decode_radius(layout, sections.radius, full, quality, reference if sections.radius_differs else None)
     colour = _decode_colour(sections.colour, layout.height, layout.width, quality.jpeg)
-    if reference is not None:
-        colour = np.clip(reference.colour.astype(np.int16) + colour - _MIDDLE, 0, 255).astype(np.uint8)
-    colour *= full[..., None]
+    colour = _restored(colour, full, None if reference is None else reference.colour)
     return LinkMaps(full, colour, radius)
 
 
@@ -129,16 +127,11 @@ def _decode_radius(
         _put_back(layout.places, full, unexpected, rounded)
     if reference is not None:
         rounded = rounded + _rounded(reference.radius, step) - np.uint8(_MIDDLE)
-    radius = np.minimum(rounded.astype(np.uint16) * step, 255).astype(np.uint8)
-    return np.where(full, radius, np.uint8(0))
+    return np.asarray(_radius_of(rounded, full, step))
 
 
 def _rounded(radius: NDArray[np.uint8], step: int) -> NDArray[np.uint8]:
     return radius.copy() if step == 1 else ((radius.astype(np.uint16) + step // 2) // step).astype(np.uint8)
-
-
-def _difference(colour: NDArray[np.uint8], known: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    return np.clip(colour.astype(np.int16) - known + _MIDDLE, 0, 255).astype(np.uint8)
 
 
 def _inflated(data: bytes, size: int) -> bytes:
@@ -208,27 +201,58 @@ def fill_empty(values, full, start, out):  # type: ignore[no-untyped-def]
     block without any that of the block before it: no difference to it, which costs a JPEG one bit."""
     height, width, channels = values.shape
     mean = start.copy()
-    sums = np.zeros(channels, np.int64)
     for top in range(0, height, BLOCK):
         for left in range(0, width, BLOCK):
-            count = 0
-            for v in range(top, top + BLOCK):
-                for u in range(left, left + BLOCK):
-                    count += full[v, u]
+            kept = full[top : top + BLOCK, left : left + BLOCK]
+            block, filled = values[top : top + BLOCK, left : left + BLOCK], out[top : top + BLOCK, left : left + BLOCK]
+            count = kept.sum()
             if count:
-                sums[:] = 0
-                for v in range(top, top + BLOCK):
-                    for u in range(left, left + BLOCK):
-                        if full[v, u]:
-                            for c in range(channels):
-                                sums[c] += values[v, u, c]
                 for c in range(channels):
-                    mean[c] = sums[c] // count
-            for v in range(top, top + BLOCK):
-                for u in range(left, left + BLOCK):
-                    kept = full[v, u]
+                    sum_ = np.int64(0)
+                    for v in range(BLOCK):
+                        for u in range(BLOCK):
+                            sum_ += block[v, u, c] * kept[v, u]
+                    mean[c] = sum_ // count
+            for v in range(BLOCK):
+                for u in range(BLOCK):
                     for c in range(channels):
-                        out[v, u, c] = values[v, u, c] if kept else mean[c]
+                        filled[v, u, c] = block[v, u, c] if kept[v, u] else mean[c]
+
+
+@njit(nogil=True, cache=True)
+def _difference(colour, known):  # type: ignore[no-untyped-def]
+    """Colours (H, W, 3) as what they are beyond ``known`` ones, ``_MIDDLE`` where they are the same."""
+    out = np.empty_like(colour)
+    for v in range(colour.shape[0]):
+        for u in range(colour.shape[1]):
+            for c in range(3):
+                out[v, u, c] = min(max(np.int32(colour[v, u, c]) - np.int32(known[v, u, c]) + _MIDDLE, 0), 255)
+    return out
+
+
+@njit(nogil=True, cache=True)
+def _restored(colour, full, known):  # type: ignore[no-untyped-def]
+    """``_difference`` undone, or ``colour`` itself where nothing is ``known``; zero in empty cells."""
+    out = np.empty_like(colour)
+    for v in range(colour.shape[0]):
+        for u in range(colour.shape[1]):
+            kept = np.int32(full[v, u])
+            for c in range(3):
+                value = np.int32(colour[v, u, c])
+                if known is not None:
+                    value = min(max(np.int32(known[v, u, c]) + value - np.int32(_MIDDLE), np.int32(0)), np.int32(255))
+                out[v, u, c] = kept * value
+    return out
+
+
+@njit(nogil=True, cache=True)
+def _radius_of(rounded, full, step):  # type: ignore[no-untyped-def]
+    """``_rounded`` undone; zero in empty cells."""
+    out = np.empty_like(rounded)
+    for v in range(rounded.shape[0]):
+        for u in range(rounded.shape[1]):
+            out[v, u] = min(np.int32(rounded[v, u]) * np.int32(step), np.int32(255)) * np.int32(full[v, u])
+    return out
 
 
 @njit(nogil=True, cache=True)
