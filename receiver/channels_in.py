@@ -114,12 +114,17 @@ class ReceiverChannels:
         self._report.put(encode_report(report))
 
     async def keep_session(self) -> None:
-        """Until cancelled: take another session where this one has come apart."""
+        """Until cancelled: take another session where this one has come apart, or does not tell the sender what is
+        taken: a declaration can be lost while the link that loses nothing is away."""
         while True:
             await asyncio.sleep(SPLIT_PERIOD_S)
-            if self._split.is_split(self._clock.now_ns()):
-                log.warning("links are up and nothing comes: another session")
+            overfull = self._layers.is_overfull(self._clock.now_ns())
+            if overfull or self._split.is_split(self._clock.now_ns()):
+                why = "more comes than is taken" if overfull else "links are up and nothing comes"
+                log.warning("%s: another session", why)
                 await self._session.reopen()
+                if overfull:
+                    self._layers.said_anew(self._clock.now_ns())
 
     def _begin_session(self) -> None:
         self._split = SplitSession()

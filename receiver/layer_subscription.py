@@ -30,6 +30,7 @@ SILENCE_NS = 1_500_000_000  # without any skeleton
 SETTLE_NS = 2_000_000_000  # so long a change takes to show, once what waits in the queue has passed
 TRIAL_NS = 5_000_000_000  # so long a path that carries nearly enough takes to show it
 PATIENCE_NS, PATIENCE_MAX_NS = 4_000_000_000, 160_000_000_000  # so long all must be well before more are tried
+OVERFULL_NS = 3_000_000_000  # with the least layers: more comes than is taken
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,6 +50,7 @@ class LayerSubscription:
     def __init__(self) -> None:
         self.layers = LAYERS
         self._patience_ns = PATIENCE_NS
+        self._overfull_ns = OVERFULL_NS
         self._joined = False  # the last change was one to more
         self._settled_ns = 0
         self._on_trial = False  # the layer that was joined last
@@ -76,6 +78,19 @@ class LayerSubscription:
     def carried_divisor(self) -> int:
         """The same without a layer that is still on trial: bulk had better wait until it has passed."""
         return divisor_of(self.layers - self._on_trial)
+
+    def is_overfull(self, now_ns: int) -> bool:
+        """Whether the path has been full for long although but the least is taken. Few paths carry less than that: more
+        probably the sender has not heard what is not taken any more, and sends it still."""
+        if self.layers > 1 or self._bad_ns is None:
+            return False
+        return now_ns - max(self._bad_ns, self._settled_ns) >= self._overfull_ns
+
+    def said_anew(self, now_ns: int) -> None:
+        """What is taken was told to the sender once more. If that does not help, the next time is later."""
+        self._overfull_ns = min(2 * self._overfull_ns, PATIENCE_MAX_NS)
+        self._settled_ns = now_ns + SETTLE_NS
+        self._forget()
 
     def skeleton(self, epoch: int, send_ns: int, arrival_ns: int) -> None:
         """The newest skeleton so far arrived; times by the sender's clock and by the receiver's."""
@@ -150,6 +165,8 @@ class LayerSubscription:
 
     def _change(self, layers: int, now_ns: int) -> None:
         self._joined = self._on_trial = layers > self.layers
+        if self._joined:
+            self._overfull_ns = OVERFULL_NS
         self.layers = layers
         self._settled_ns = now_ns + (TRIAL_NS if self._on_trial else SETTLE_NS) + int(self._heard[-1].queueing_s / NS)
         self._forget()

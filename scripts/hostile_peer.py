@@ -19,7 +19,7 @@ from common.wire.receiver_report import ReceiverReport, encode_report
 
 def pair(port: int) -> list[str]:
     """Zenoh's locators of the secure pair on loopback."""
-    return [f"quic/127.0.0.1:{port}?rel=0", f"tls/127.0.0.1:{port}?rel=1"]
+    return [f"quic/127.0.0.1:{port}?mixed_rel=1;prio=0-5", f"tls/127.0.0.1:{port}?rel=1;prio=6-7"]
 
 
 def outsider(

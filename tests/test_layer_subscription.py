@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from common.transport.temporal_layers import LAYERS, between, divisor_of, layer_of
-from receiver.layer_subscription import BAD_NS, PATIENCE_NS, SETTLE_NS, TRIAL_NS, LayerSubscription
+from receiver.layer_subscription import BAD_NS, OVERFULL_NS, PATIENCE_NS, SETTLE_NS, TRIAL_NS, LayerSubscription
 from scripts.bulk_simulation import MS, BulkSimulation, Competitor, S
 from scripts.link_model import LinkConditions
 
@@ -167,3 +169,22 @@ def test_another_run_of_the_sender_has_another_clock_and_the_same_path() -> None
     assert receiver.layers.layers == 3
     receiver.live(5, epoch=2)
     assert receiver.layers.layers == 3
+
+
+def test_who_takes_the_least_and_still_has_a_full_path_says_it_anew_and_again_later_if_that_does_not_help() -> None:
+    receiver = Thin(0)  # its sender never heard that no more are taken
+    said: list[int] = []
+    for frame in range(60 * 30):
+        receiver.live(1 / 30)
+        if receiver.layers.is_overfull(frame * FRAME_NS):
+            said.append(frame * FRAME_NS)
+            receiver.layers.said_anew(frame * FRAME_NS)
+    assert [layers for _, layers in receiver.changes] == [3, 2, 1]
+    assert said[0] - receiver.changes[-1][0] >= SETTLE_NS + OVERFULL_NS
+    waited = [after - before for before, after in pairwise(said)]
+    assert len(waited) >= 2
+    assert waited[1] > 1.5 * waited[0]
+    heard = Thin(1)
+    heard.live(60)
+    assert heard.changes[2][1] == 1
+    assert not heard.layers.is_overfull(60 * S)  # what its path carries is well

@@ -50,6 +50,8 @@ from tests.listening_sockets import listening_ports
 ROUTER_FILE = Path(__file__).parents[1] / "deploy" / "router.json5"
 CLOCK = MonotonicClock()
 NAME = "lobby.1"
+LINKS = 3  # QUIC has two, streams and datagrams
+QUIC_PRIORITIES, BULK_PRIORITIES = (0, 5), (6, 7)
 
 
 @pytest.fixture(scope="module")
@@ -127,15 +129,18 @@ async def stream(sites: Path) -> AsyncIterator[Stream]:
         yield made
 
 
-async def test_one_setting_gives_a_datagram_link_and_a_tls_link_with_names_at_both_ends(sites: Path) -> None:
+async def test_one_setting_gives_quic_and_a_tls_link_for_bulk_with_names_at_both_ends(sites: Path) -> None:
     async with stream(sites) as made:
-        await until(lambda: len(made.studio.zenoh.info.links()) == 2)
+        await until(lambda: len(made.studio.zenoh.info.links()) == LINKS)
         for session, other in ((made.studio, "lobby"), (made.lobby, "studio")):
-            links = {link.dst.partition("/")[0]: link for link in map(_any, session.zenoh.info.links())}
-            assert set(links) == {"quic", "tls"}
-            assert str(links["quic"].reliability) == "Reliability.BEST_EFFORT"
-            assert str(links["tls"].reliability) == "Reliability.RELIABLE"
-            assert {link.auth_identifier for link in links.values()} == {other}
+            links = [_any(link) for link in session.zenoh.info.links()]
+            told = {(link.dst.partition("/")[0], str(link.reliability), link.priorities) for link in links}
+            assert told == {
+                ("quic", "Reliability.BEST_EFFORT", QUIC_PRIORITIES),
+                ("quic", "Reliability.RELIABLE", QUIC_PRIORITIES),
+                ("tls", "Reliability.RELIABLE", BULK_PRIORITIES),
+            }
+            assert {link.auth_identifier for link in links} == {other}
         assert await ask(made.lobby, BODY, key(BODY)) == [b"body"]
         assert await ask(made.lobby, REPOSITORY, key(REPOSITORY, NAME)) == [b"list"]
 
@@ -212,7 +217,7 @@ async def test_a_valid_certificate_opens_no_foreign_keys_in_either_direction(sit
         studio.watch_presence(key(channels.RECEIVER_PRESENCE, "*"), lambda name, _: present.append(name))
         attacker = await asyncio.to_thread(outsider, pair(port), sites / site)
         try:
-            await until(lambda: len(studio.zenoh.info.links()) == 2)
+            await until(lambda: len(studio.zenoh.info.links()) == LINKS)
             victim = "wall.1" if site == "lobby" else NAME
             foreign = [key(BULK, victim), key(REPORT, "*"), key(SKELETON, site="other"), "**"]
             mine = ["v1/other/0/skeleton/0", key(REPORT, victim), key(SKELETON), key(BULK, victim), key(BODY)]
@@ -285,7 +290,7 @@ async def test_a_dialling_process_has_no_port_open_to_anyone(sites: Path) -> Non
         command = [sys.executable, "-c", DIALLER, str(sites / "lobby"), f"127.0.0.1:{port}"]
         process = await asyncio.create_subprocess_exec(*command, stderr=subprocess.DEVNULL)
         try:
-            await until(lambda: len(studio.zenoh.info.links()) == 2)
+            await until(lambda: len(studio.zenoh.info.links()) == LINKS)
             ports = listening_ports(process.pid)
             assert {protocol for protocol, _ in ports} == {"udp"}  # the QUIC client's own
             for _, udp_port in ports:
@@ -331,7 +336,7 @@ async def test_too_large_a_message_vanishes_and_the_stream_goes_on(sites: Path, 
         session, name = (made.studio, key(BODY)) if certificate == "studio" else (made.lobby, key(REPORT, NAME))
         await asyncio.to_thread(session.zenoh.put, name, bytes(3 << 20))
         assert await made.flows()
-        assert len(made.studio.zenoh.info.links()) == 2
+        assert len(made.studio.zenoh.info.links()) == LINKS
 
 
 def change(folder: Path, what: str) -> None:

@@ -90,9 +90,13 @@ def _check_secure(key: str, locator: str) -> None:
 
 
 def zenoh_locators(locator: str) -> tuple[str, ...]:
-    """Zenoh's locators for one of ``LinkSettings``: of a plain ``host:port`` the secure pair."""
+    """Zenoh's locators for one of ``LinkSettings``: of a plain ``host:port`` the secure pair.
+
+    QUIC has datagrams for skeletons and reports, and streams for all that must not get lost: whichever link comes
+    first, what either end declares then arrives. TLS carries bulk (its priorities) alone, which fills it.
+    """
     if _ADDRESS.fullmatch(locator):
-        return f"quic/{locator}?rel=0", f"tls/{locator}?rel=1"
+        return f"quic/{locator}?mixed_rel=1;prio=0-5", f"tls/{locator}?rel=1;prio=6-7"
     return (locator,)
 
 
