@@ -95,7 +95,9 @@ class ReceiverChannels:
             self.subscribers["skeleton"].add(self._key(channels.SKELETON, layer=layer))
         self._listen(channels.BODY, self._key(channels.BODY), self._on_body)
         self._listen(channels.BULK, self._key(channels.BULK, self._name), self._on_chunk)
-        self._session.watch_links(self._begin_session, lambda up: self._split.link(up, self._clock.now_ns()))
+        self._session.watch_links(
+            self._begin_session, lambda link, up: self._split.link(link, up, self._clock.now_ns())
+        )
         self._session.declare_presence(self._key(channels.RECEIVER_PRESENCE, self._name))
         self._session.watch_presence(self._key(channels.SENDER_PRESENCE), lambda _, present: handlers.presence(present))
 
@@ -114,17 +116,17 @@ class ReceiverChannels:
         self._report.put(encode_report(report))
 
     async def keep_session(self) -> None:
-        """Until cancelled: take another session where this one has come apart, or does not tell the sender what is
-        taken: a declaration can be lost while the link that loses nothing is away."""
+        """Until cancelled: take another session where this one has come apart, or the sender has not heard what is not
+        taken any more: what was on its way on a link that was lost is lost with it."""
         while True:
             await asyncio.sleep(SPLIT_PERIOD_S)
-            overfull = self._layers.is_overfull(self._clock.now_ns())
-            if overfull or self._split.is_split(self._clock.now_ns()):
+            now_ns = self._clock.now_ns()
+            overfull = self._split.lost_any and self._layers.is_overfull(now_ns)
+            if overfull or self._split.is_split(now_ns):
                 why = "more comes than is taken" if overfull else "links are up and nothing comes"
                 log.warning("%s: another session", why)
                 await self._session.reopen()
-                if overfull:
-                    self._layers.said_anew(self._clock.now_ns())
+                self._layers.said_anew(self._clock.now_ns(), overfull)
 
     def _begin_session(self) -> None:
         self._split = SplitSession()
@@ -194,7 +196,7 @@ class ReceiverChannels:
 
     def _on_skeleton(self, arrival: Arrival) -> None:
         assert self._handlers is not None
-        self._split.heard()
+        self._split.heard(not self.stream.lacks_body, arrival.arrival_ns)
         newest = self.stream.skeleton(arrival.payload, arrival.arrival_ns)
         if newest is None:
             return

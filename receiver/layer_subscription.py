@@ -80,15 +80,16 @@ class LayerSubscription:
         return divisor_of(self.layers - self._on_trial)
 
     def is_overfull(self, now_ns: int) -> bool:
-        """Whether the path has been full for long although but the least is taken. Few paths carry less than that: more
-        probably the sender has not heard what is not taken any more, and sends it still."""
-        if self.layers > 1 or self._bad_ns is None:
+        """Whether the path has been full for long although but the least is taken. Few paths carry less than that: the
+        sender may not have heard what is not taken any more, and send it still."""
+        if self.layers > 1 or self._bad_ns is None or now_ns - self._last[0] > SILENCE_NS:
             return False
         return now_ns - max(self._bad_ns, self._settled_ns) >= self._overfull_ns
 
-    def said_anew(self, now_ns: int) -> None:
-        """What is taken was told to the sender once more. If that does not help, the next time is later."""
-        self._overfull_ns = min(2 * self._overfull_ns, PATIENCE_MAX_NS)
+    def said_anew(self, now_ns: int, overfull: bool) -> None:
+        """What is taken was told to the sender once more. If that was since the path was ``overfull``, the next time is
+        later: it may not help."""
+        self._overfull_ns = min(2 * self._overfull_ns, PATIENCE_MAX_NS) if overfull else OVERFULL_NS
         self._settled_ns = now_ns + SETTLE_NS
         self._forget()
 

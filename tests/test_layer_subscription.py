@@ -9,7 +9,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from common.transport.temporal_layers import LAYERS, between, divisor_of, layer_of
-from receiver.layer_subscription import BAD_NS, OVERFULL_NS, PATIENCE_NS, SETTLE_NS, TRIAL_NS, LayerSubscription
+from receiver.layer_subscription import (
+    BAD_NS,
+    OVERFULL_NS,
+    PATIENCE_NS,
+    SETTLE_NS,
+    SILENCE_NS,
+    TRIAL_NS,
+    LayerSubscription,
+)
 from scripts.bulk_simulation import MS, BulkSimulation, Competitor, S
 from scripts.link_model import LinkConditions
 
@@ -178,12 +186,16 @@ def test_who_takes_the_least_and_still_has_a_full_path_says_it_anew_and_again_la
         receiver.live(1 / 30)
         if receiver.layers.is_overfull(frame * FRAME_NS):
             said.append(frame * FRAME_NS)
-            receiver.layers.said_anew(frame * FRAME_NS)
+            receiver.layers.said_anew(frame * FRAME_NS, True)
     assert [layers for _, layers in receiver.changes] == [3, 2, 1]
     assert said[0] - receiver.changes[-1][0] >= SETTLE_NS + OVERFULL_NS
     waited = [after - before for before, after in pairwise(said)]
     assert len(waited) >= 2
     assert waited[1] > 1.5 * waited[0]
+    silent = Thin(0)
+    silent.live(25)
+    assert silent.layers.is_overfull(25 * S)
+    assert not silent.layers.is_overfull(25 * S + 2 * SILENCE_NS)  # nothing comes any more: that is something else
     heard = Thin(1)
     heard.live(60)
     assert heard.changes[2][1] == 1

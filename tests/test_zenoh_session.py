@@ -218,7 +218,7 @@ async def test_another_session_takes_over_all_that_was_declared(endpoint: str, w
         dialler, listener = ends.dialler, ends.listener
         listener.watch_presence(presence, lambda *change: seen.append(change))
         dialler.declare_presence(presence)
-        dialler.watch_links(lambda: sessions.append(str(dialler.zenoh.zid())), links.append)
+        dialler.watch_links(lambda: sessions.append(str(dialler.zenoh.zid())), lambda _, up: links.append(up))
         there, back = ChannelPublisher(listener, SKELETON, KEY), ChannelPublisher(dialler, BODY, body)
         inbox, returned = Inbox(dialler), Inbox(listener, BODY, body)
         ChannelQueryable(dialler, CLOCK, question, lambda _: b"here")

@@ -1,7 +1,7 @@
 """How a daemon reaches the others: one table of its settings, and what Zenoh's locators come of it.
 
 With ``certificates`` an address is dialled or listened on twice, as the secure pair on one port number of UDP and TCP:
-QUIC datagrams for skeletons and reports, which a lost packet must not hold up, and TLS for all that has to arrive.
+QUIC, with datagrams for skeletons and reports, which a lost packet must not hold up, and TLS for bulk.
 """
 
 from __future__ import annotations

@@ -211,17 +211,20 @@ class ZenohSession:
         handler = Callback(happened, indirect=False)
         self.declare(lambda session: session.info.declare_transport_events_listener(handler, history=True))
 
-    def watch_links(self, on_new_session: Callable[[], None], on_change: Callable[[bool], None]) -> None:
-        """Call ``on_change(up)`` for every link that is open now and for every change from now on, after
-        ``on_new_session``, which is called for each session."""
+    def watch_links(self, on_new_session: Callable[[], None], on_change: Callable[[str, bool], None]) -> None:
+        """Call ``on_change(link, up)`` for every link that is open now and for every change from now on, after
+        ``on_new_session``, which is called for each session. QUIC's streams and datagrams are one link, which may be
+        said to be down twice."""
 
         def listen(session: zenoh.Session) -> zenoh.LinkEventsListener[None]:
             def happened(event: zenoh.LinkEvent) -> None:
-                self.on_loop(tell, event.kind == zenoh.SampleKind.PUT)
+                link: Any = event.link  # its annotations are wrong
+                name = f"{link.zid} {link.src} {link.dst}"
+                self.on_loop(tell, name, event.kind == zenoh.SampleKind.PUT)
 
-            def tell(up: bool) -> None:
+            def tell(link: str, up: bool) -> None:
                 if session is self.zenoh:  # one that was replaced loses all its links
-                    on_change(up)
+                    on_change(link, up)
 
             on_new_session()
             return session.info.declare_link_events_listener(Callback(happened, indirect=False), history=True)
