@@ -188,9 +188,11 @@ def interrupted(work: Callable[..., Iterator[T]], after: int) -> Callable[..., I
     return stopped
 
 
-def test_ctrl_c_keeps_what_was_encoded_and_decoded_by_then(recording, session, tmp_path, monkeypatch):
+def test_ctrl_c_keeps_what_was_encoded_and_decoded_by_then(recording, session, tmp_path, monkeypatch, request):
     monkeypatch.setattr("sender.encode.frame_sets", interrupted(frame_sets, 12))
     monkeypatch.setattr("receiver.decode.display_ticks", interrupted(display_ticks, 7))
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored where the tests run in the background
+    request.addfinalizer(lambda: signal.signal(signal.SIGINT, before))
     said: list[str] = []
     assert encode(SenderSettings(), EncodeOptions(recording, tmp_path / "s.mcap", 4.0), said.append) == 130
     assert said[0] == "stopped; what was encoded by then is kept"
