@@ -123,7 +123,7 @@ class ReceiverChannels:
             now_ns = self._clock.now_ns()
             overfull = self._split.lost_any and self._layers.is_overfull(now_ns)
             if overfull or self._split.is_split(now_ns):
-                why = "more comes than is taken" if overfull else "links are up and nothing comes"
+                why = "more comes than is taken" if overfull else "links are up, but nothing comes, or no answers"
                 log.warning("%s: another session", why)
                 await self._session.reopen()
                 self._layers.said_anew(self._clock.now_ns(), overfull)
